@@ -74,6 +74,18 @@ def check_once(files: Sequence[Path], where: str = "") -> None:
         seen.add(path.resolve())
 
 
+def check_present(path: Path) -> None:
+    """Refuse a recording that is missing or empty.
+
+    Raises:
+        SourceError: Naming it.
+    """
+    if not path.is_file():
+        raise SourceError(f"{path}: there is no such file; check the path of the recording")
+    if path.stat().st_size == 0:
+        raise SourceError(f"{path}: the file is empty; record it again")
+
+
 BEGINNINGS = {
     b"PK\x03\x04": "an Excel workbook or a ZIP archive; export the sheet as CSV",
     b"\x89HDF": "HDF5; export it as Parquet or CSV",

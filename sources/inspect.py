@@ -19,7 +19,7 @@ from estimators.log import READING
 from .can.decoder import Decoder, load_database, same_bus
 from .can.log import CanLog, check_log, frames_reader
 from .can.readers import EXTENDED, BusName, LogSummary, Raw
-from .formats import CAN_LOGS, check_once, suffix_of
+from .formats import CAN_LOGS, check_once, check_present, suffix_of
 from .source import UNDATED, Channel
 from .tables.order import Order, time_order
 from .tables.rows import TableRows, is_bag, is_text, names_of, rows_of
@@ -153,10 +153,7 @@ def inspect_recordings(
     for path in files:
         if path.is_dir():
             raise SourceError(f"{path}: it is a folder; name the recordings in it")
-        if not path.is_file():
-            raise SourceError(f"{path}: there is no such file; check the path")
-        if not path.stat().st_size:
-            raise SourceError(f"{path}: the file is empty; record it again")
+        check_present(path)
     check_once(files)
     groups: dict[tuple[str, ...], list[Path]] = {}
     for path in files:

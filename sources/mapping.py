@@ -351,7 +351,7 @@ class ChannelMapping:
             return
         fixes = batch.value[rows, :2]
         if self._origins[channel.index] is None:
-            valid = np.flatnonzero((np.abs(fixes[:, 0]) <= 90) & (np.abs(fixes[:, 1]) <= 180))
+            valid = np.flatnonzero(_on_earth(fixes))
             if not valid.size:
                 batch.value[rows, :2] = np.nan
                 return
@@ -384,6 +384,11 @@ def _earth_fixed(latitude: np.ndarray, longitude: np.ndarray) -> tuple[np.ndarra
     return x, y, normal * (1 - ECCENTRICITY2) * np.sin(latitude)
 
 
+def _on_earth(fixes: np.ndarray) -> np.ndarray:
+    """Return which fixes (n, 2), in degrees, are a latitude and a longitude."""
+    return (np.abs(fixes) <= (90, 180)).all(axis=1)
+
+
 def east_north(fixes: np.ndarray, origin: tuple[float, float]) -> np.ndarray:
     """Metres east and north of the origin, in the plane that touches the WGS84 ellipsoid there.
 
@@ -400,8 +405,7 @@ def east_north(fixes: np.ndarray, origin: tuple[float, float]) -> np.ndarray:
 
     Source: NIMA TR8350.2 (2000), section 4; Groves (2013), Principles of GNSS, equations 2.112 and 2.150.
     """
-    valid = (np.abs(fixes[:, 0]) <= 90) & (np.abs(fixes[:, 1]) <= 180)
-    latitude, longitude = np.radians(np.where(valid, fixes.T, np.nan))
+    latitude, longitude = np.radians(np.where(_on_earth(fixes), fixes.T, np.nan))
     lat0, lon0 = np.radians(np.asarray(origin, float))
     dx, dy, dz = (a - b for a, b in zip(_earth_fixed(latitude, longitude), _earth_fixed(lat0, lon0), strict=True))
     east = -np.sin(lon0) * dx + np.cos(lon0) * dy

@@ -139,7 +139,7 @@ def serve(lifeline: int) -> None:
 
 def gist(error: object) -> str:
     """Return the message of an error, or its type if it has none, in one short line."""
-    return " ".join(str(error).split())[:160] or type(error).__name__
+    return " ".join(str(getattr(error, "strerror", None) or error).split())[:160] or type(error).__name__
 
 
 def _end_with_parent(lifeline: int) -> None:

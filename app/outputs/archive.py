@@ -16,6 +16,7 @@ import numpy as np
 
 from estimators.events.batch import MAINTENANCE
 from estimators.interface.table import table_of
+from sources.worker_process import gist
 
 from ..live.history_copy import last_written
 from ..live.jobs import join
@@ -77,8 +78,7 @@ class Archive:
         except Exception as error:  # noqa: BLE001  whatever a file system does, the twin goes on
             self._abandon()
             if not self._failed:
-                reason = error.strerror if isinstance(error, OSError) and error.strerror else str(error)
-                text = f"archive {self._folder}: cannot be written ({reason}); the twin goes on, and tries again"
+                text = f"archive {self._folder}: cannot be written ({gist(error)}); the twin goes on, and tries again"
                 self._engine.notices.say(text, level="error")
             self._failed = True
             return RETRY_PERIOD_S

@@ -20,6 +20,7 @@ import numpy as np
 from estimators.errors import SourceError
 from estimators.events.batch import KIND_NAMES, READING, Events
 from sources.source import Report
+from sources.worker_process import gist
 
 from ..live.jobs import join
 from .archive_journal import JOURNAL, Journal, complete_journal, complete_journals, read_journal
@@ -145,8 +146,7 @@ class FleetArchive:
 
     def _fail(self, error: Exception) -> None:
         if not self._failed:
-            reason = error.strerror if isinstance(error, OSError) and error.strerror else str(error)
-            text = f"archive {self._folder}: cannot be written ({reason}); the fleet goes on, and tries again"
+            text = f"archive {self._folder}: cannot be written ({gist(error)}); the fleet goes on, and tries again"
             self._report("archive", text)
         self._failed = True
 

@@ -30,6 +30,7 @@ from urllib.request import HTTPHandler, HTTPRedirectHandler, HTTPSHandler, Reque
 from config.output_schema import CommandSection, EmailSection, WebhookSection
 from estimators.compiled.orphan import killed_with_parent
 from estimators.errors import printable
+from sources.worker_process import gist
 
 from ..live.jobs import Job, Jobs
 from ..live.notices import Notices
@@ -302,8 +303,7 @@ class Delivery:
         # One line an outage; each failure is counted.
         self._notices.count("alert receiver")
         if self._failures == 1:
-            reason = str(getattr(error, "strerror", None) or error) or type(error).__name__
-            text = " ".join(printable(reason).split())[:200]
+            text = printable(gist(error))
             self._notices.say(f"alerts: receiver {self.name} fails ({text}); they wait, and it is tried again", "warn")
         return pause
 

@@ -17,6 +17,7 @@ from config.model_schema import FmuSection, variable_name
 from config.yaml_files import Key, shown_path
 from estimators.errors import ModelError, nearest
 from estimators.model.state_space import Input, Noise, Parameter, Row, Sensor, State, StateSpaceModel, squared
+from sources.worker_process import gist
 
 from .checks import check_stated
 from .fmu_instance import Fmu
@@ -52,8 +53,7 @@ def _model(path: Path, section: FmuSection, places: Loaded) -> StateSpaceModel:
     try:
         description = fmpy.read_model_description(str(path))
     except Exception as error:  # noqa: BLE001  of XML, zip files and FMPy
-        text = " ".join(str(error).split())[:200] or type(error).__name__
-        raise ModelError(f"{shown_path(path)}: it is no readable FMU ({text}); export it again") from None
+        raise ModelError(f"{shown_path(path)}: it is no readable FMU ({gist(error)}); export it again") from None
     _check_kind(description, path)
     states = [unknown.variable.derivative for unknown in description.derivatives]
     found = _Variables(description, section, places)

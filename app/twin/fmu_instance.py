@@ -26,6 +26,7 @@ import numpy as np
 
 from config.yaml_files import shown_path
 from estimators.errors import ModelError
+from sources.worker_process import gist
 
 FATAL = 4
 """Status of a call after which no instance of the FMU may be used."""
@@ -109,8 +110,7 @@ class Fmu:
         except ModelError:
             raise
         except Exception as error:  # noqa: BLE001  FMPy raises bare exceptions
-            text = " ".join(str(error).split()) or type(error).__name__
-            raise ModelError(f"{self._name}: it {what}: {text}; {remedy}") from None
+            raise ModelError(f"{self._name}: it {what}: {gist(error)}; {remedy}") from None
 
     def start(self) -> np.ndarray:
         """Return the states (nx,) after initialisation, and check what a filter needs.

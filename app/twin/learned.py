@@ -15,6 +15,7 @@ from estimators.errors import ConfigError
 from estimators.model.correction import Correction, GaussianProcess, Net, Ridge
 from estimators.model.hybrid import LearnedCorrection
 from estimators.model.state_space import StateSpaceModel
+from sources.worker_process import gist
 
 INSTALL = "pip install 'nisus[learned]'"
 
@@ -96,8 +97,7 @@ def run_net(path: Path, features: int, corrects: int) -> Callable[[np.ndarray], 
     try:
         session = onnxruntime.InferenceSession(path.read_bytes(), options, providers=["CPUExecutionProvider"])
     except Exception as error:  # noqa: BLE001  its errors have no common base but this
-        gist = str(error).strip().splitlines()[0]
-        raise ConfigError(f"{shown_path(path)}: it cannot be read as an ONNX network: {gist}") from None
+        raise ConfigError(f"{shown_path(path)}: it cannot be read as an ONNX network: {gist(error)}") from None
     given, told = session.get_inputs(), session.get_outputs()
     kinds = {"tensor(float)": np.float32, "tensor(double)": np.float64}
     if len(given) != 1 or given[0].type not in kinds:
@@ -114,8 +114,7 @@ def run_net(path: Path, features: int, corrects: int) -> Callable[[np.ndarray], 
     try:
         found = run(np.zeros((1, features)))
     except Exception as error:  # noqa: BLE001  as above
-        gist = str(error).strip().splitlines()[0]
-        raise ConfigError(f"{shown_path(path)}: it does not take {features} features: {gist}") from None
+        raise ConfigError(f"{shown_path(path)}: it does not take {features} features: {gist(error)}") from None
     if found.shape != (1, corrects):
         raise ConfigError(
             f"{shown_path(path)}: it gives {found.shape[1]} numbers; it must give one for each of {corrects} corrected "

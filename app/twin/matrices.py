@@ -14,6 +14,7 @@ from config.yaml_files import shown_path
 from estimators.errors import ConfigError, ModelError, nearest
 from estimators.model.linear import linear_model
 from estimators.model.state_space import Input, Row, State, StateSpaceModel
+from sources.worker_process import gist
 
 from .checks import check_stated
 
@@ -71,8 +72,7 @@ def _read(path: Path, loaded: Loaded) -> Mapping[str, Any]:
         rule = "MATLAB wrote it as v7.3; write it with save(..., '-v7')"
         raise ConfigError(f"{shown_path(path)}: {rule}") from None
     except Exception as error:  # noqa: BLE001  readers of damaged files raise anything
-        text = " ".join(str(error).split()) or type(error).__name__
-        raise ConfigError(f"{shown_path(path)}: it cannot be read ({text}); write it again") from None
+        raise ConfigError(f"{shown_path(path)}: it cannot be read ({gist(error)}); write it again") from None
     raise loaded.error(("model", "matrices"), f"is {path.name!r}; it must be a .mat or a .npz file")
 
 

@@ -20,6 +20,7 @@ from estimators.errors import SourceError
 from estimators.log import Events
 
 from ..source import LOST_FRAMES, NEVER, Report, ignore
+from ..worker_process import gist
 from .decoder import Decoder, Expected, shown_id
 from .readers import EXTENDED, BusName
 from .sockets import FrameSocket, frame_socket
@@ -57,9 +58,8 @@ def open_bus(interface: str, channel: str | int, options: Mapping[str, Any], fil
             _keep_own_group(bus)
         return bus
     except Exception as error:  # noqa: BLE001  drivers raise anything: OSError, ValueError, ImportError, their own
-        reason = " ".join(str(error).split())[:200] or type(error).__name__
         raise SourceError(
-            f"CAN bus {interface}:{channel}: it cannot be opened ({reason}); check interface, channel and options"
+            f"CAN bus {interface}:{channel}: it cannot be opened ({gist(error)}); check interface, channel and options"
         ) from None
 
 
@@ -163,7 +163,7 @@ class CanBus:
 
     def _failed(self, error: Exception) -> None:
         """Report an error. One may be a bad packet; after two in a row the bus is opened again."""
-        self._report("bus error", f"CAN bus {self._name}: {' '.join(str(error).split()) or type(error).__name__}")
+        self._report("bus error", f"CAN bus {self._name}: {gist(error)}")
         if not self._failed_before:
             self._failed_before = True
             return

@@ -14,7 +14,7 @@ import can
 from estimators.errors import SourceError
 from estimators.log import Events
 
-from ..formats import CAN_LOGS, is_compressed, suffix_of
+from ..formats import CAN_LOGS, check_present, is_compressed, suffix_of
 from ..source import NEVER, TRUNCATED, Report, ignore
 from ..units import second_ns
 from ..worker_process import IsolatedReader, read_isolated
@@ -121,10 +121,7 @@ def check_log(path: Path) -> None:
     Raises:
         SourceError: If the file is missing, empty, or of no known format.
     """
-    if not path.is_file():
-        raise SourceError(f"{path}: there is no such file; check the path of the recording")
-    if path.stat().st_size == 0:
-        raise SourceError(f"{path}: the file is empty; record it again")
+    check_present(path)
     if suffix_of(path) not in CAN_LOGS or (is_compressed(path) and path.suffix.lower() != ".gz"):
         raise SourceError(
             f"{path}: {path.suffix or 'a bare name'} is not a CAN log format; choose from {', '.join(CAN_LOGS)}"

@@ -20,6 +20,7 @@ from typing import Any
 
 import numpy as np
 
+from ..worker_process import gist
 from .readers import CHUNK_FRAMES, EXTENDED, BusName, LogSummary, Raw, unreadable
 
 
@@ -118,8 +119,7 @@ def _read(
         except MemoryError:
             raise
         except Exception as error:  # noqa: BLE001  as above; the other groups may be complete
-            gist = " ".join(f"{error}".split())[:100] or type(error).__name__
-            fault = fault or f"{cycles} frames cannot be read: {gist}"
+            fault = fault or f"{cycles} frames cannot be read: {gist(error)}"
             continue
         total += len(signal)
         if len(signal) < cycles:

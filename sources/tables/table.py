@@ -12,7 +12,7 @@ import numpy as np
 from estimators.errors import SourceError, nearest
 from estimators.log import Events
 
-from ..formats import suffix_of
+from ..formats import check_present, suffix_of
 from ..mapping import ABSENT, PRESENT, ChannelMapping
 from ..source import NEVER, TRUNCATED, UNASSIGNED, Channel, Report, ignore
 from ..units import heading_unit
@@ -188,10 +188,7 @@ def _check(path: Path, wanted: Sequence[str]) -> None:
     Raises:
         SourceError: Naming the file, the column and those that are near.
     """
-    if not path.is_file():
-        raise SourceError(f"{path}: there is no such file; check the path of the recording")
-    if path.stat().st_size == 0:
-        raise SourceError(f"{path}: the file is empty; record it again")
+    check_present(path)
     names = names_of(path)
     found = Counter(names)
     for name in wanted:

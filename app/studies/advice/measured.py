@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 import time
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from concurrent.futures import Executor
 from dataclasses import dataclass, field, replace
 from functools import cached_property
@@ -62,36 +62,38 @@ def without_faults(twin: Twin, log: Log, known: Sequence[Episode] | None = None)
         known = episodes(Measured(twin, log).folded(twin.estimator).fold)
     t, clean = log.t[: log.n] * 1e-9, log.copy()
     found: list[Exclusion] = []
-    for k, sensor in enumerate(twin.model.sensors):
-        own = (log.kind[: log.n] == READING) & (log.channel[: log.n] == k)
-        for column, row in enumerate(sensor.rows):
-            readings = own & np.isfinite(log.value[: log.n, column])
-            left_out, listed = np.zeros(log.n, bool), []
-            for item in known:
-                detector = detector_of(item.cause)
-                if item.subject not in (row.name, sensor.name) or not (detector.sensor_lost or detector.isolate):
-                    continue
-                end = float(t[-1]) if item.end is None else item.end
-                rows = readings & (t >= item.start) & (t <= end)
-                if rows.any():
-                    left_out |= rows
-                    listed.append(Exclusion(row.name, item.cause, item.start, end, int(rows.sum())))
-            if listed and left_out.sum() <= MAX_EXCLUDED_SHARE * readings.sum():
-                clean.value[: log.n, column][left_out] = np.nan
-                found += listed
+    for sensor, row, column, readings in _rows_of(twin.model, log):
+        left_out, listed = np.zeros(log.n, bool), []
+        for item in known:
+            detector = detector_of(item.cause)
+            if item.subject not in (row, sensor) or not (detector.sensor_lost or detector.isolate):
+                continue
+            end = float(t[-1]) if item.end is None else item.end
+            rows = readings & (t >= item.start) & (t <= end)
+            if rows.any():
+                left_out |= rows
+                listed.append(Exclusion(row, item.cause, item.start, end, int(rows.sum())))
+        if listed and left_out.sum() <= MAX_EXCLUDED_SHARE * readings.sum():
+            clean.value[: log.n, column][left_out] = np.nan
+            found += listed
     return (clean, tuple(sorted(found, key=lambda item: (item.start, item.row)))) if found else (log, ())
 
 
 def repeats_of(model: StateSpaceModel, log: Log) -> dict[str, Finding]:
     """Return how the measurements of each sensor row repeat."""
-    found = {}
+    return {
+        row: find_repeats(log.t[: log.n][known], log.value[: log.n, column][known])
+        for _, row, column, known in _rows_of(model, log)
+        if known.any()
+    }
+
+
+def _rows_of(model: StateSpaceModel, log: Log) -> Iterator[tuple[str, str, int, np.ndarray]]:
+    """Yield sensor, name and column of each sensor row, and which events of the log (N,) have a value of it."""
     for k, sensor in enumerate(model.sensors):
         own = (log.kind[: log.n] == READING) & (log.channel[: log.n] == k)
         for column, row in enumerate(sensor.rows):
-            known = own & np.isfinite(log.value[: log.n, column])
-            if known.any():
-                found[row.name] = find_repeats(log.t[: log.n][known], log.value[: log.n, column][known])
-    return found
+            yield sensor.name, row.name, column, own & np.isfinite(log.value[: log.n, column])
 
 
 def repeat_lines(found: Mapping[str, Finding]) -> list[str]:

@@ -18,6 +18,7 @@ from typing import TYPE_CHECKING, Any
 
 from estimators.diagnostics.health import MAX_ROWS_PER_READING
 from estimators.errors import NisusError, SourceError
+from sources.worker_process import gist
 
 from ...format_time import counted
 from ...live.jobs import join
@@ -177,9 +178,8 @@ class Recorder:
     def _reason(self, error: Exception) -> str:
         if self._open is None:
             return f"{type(error).__name__}: {error}"
-        reason = error.strerror if isinstance(error, OSError) and error.strerror else str(error)
         path = self._open.file.path
-        return f"{path}: it can no longer be written ({reason}); the recording up to here can be reviewed"
+        return f"{path}: it can no longer be written ({gist(error)}); the recording up to here can be reviewed"
 
     def _fail(self, text: str) -> None:
         if not self._asked:

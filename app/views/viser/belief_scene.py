@@ -13,7 +13,7 @@ from estimators.numerics.peaks import Peak
 
 from ...live.outputs import Belief
 from ...present.drawing.colors import Palette, mixed, round_step, tick_text
-from .scene import History, Outlook, PeakMarks, Shapes, circle, disc, ellipsoid, segments
+from .scene import SQUARE, History, Outlook, PeakMarks, Shapes, circle, disc, ellipsoid, segments
 
 TRAIL_ROWS = 80  # Rows of the track in the trail
 
@@ -212,8 +212,7 @@ def _title_place(k: int, flat: bool) -> tuple[float, float, float]:
 
 
 def _frame(flat: bool) -> np.ndarray:
-    square = np.array([[-1, -1], [1, -1], [1, 1], [-1, 1], [-1, -1]], float)
-    bottom = segments(np.column_stack((square, np.full(5, 0.0 if flat else -1.0))))
+    bottom = segments(np.column_stack((SQUARE, np.full(5, 0.0 if flat else -1.0))))
     if flat:
         return bottom
     up = [[[x, y, -1], [x, y, 1]] for x, y in ((-1, -1), (-1, 1), (1, 1))]

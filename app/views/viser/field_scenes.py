@@ -25,7 +25,7 @@ from ...present.drawing.colors import (
     sensor_colors,
     take_innovations,
 )
-from .scene import History, Outlook, Shapes, put_points, segments, set_color, set_text
+from .scene import SQUARE, History, Outlook, Shapes, put_points, segments, set_color, set_text
 
 PICTURE_PERIOD_S = 0.5  # Seconds between two pictures
 MAX_TICKS = 12  # Numbers beside the scale
@@ -169,7 +169,7 @@ class FieldSurfaceScene(FieldView):
         self._meshes = [shapes.body("mesh_simple", f"bands/{k}", *start, **style) for k in range(SURFACE_COLORS)]
         self._bars = shapes.lines("bars", theme.ink, 1.5)
         low = -0.5 * SURFACE_HEIGHT
-        floor = np.column_stack((np.array([[-1, -1], [1, -1], [1, 1], [-1, 1], [-1, -1]]) * half, np.full(5, low)))
+        floor = np.column_stack((SQUARE * half, np.full(5, low)))
         upright = np.array([[-half[0], -half[1], low], [-half[0], -half[1], -low]])
         shapes.lines("frame", theme.bound, 1.5, np.concatenate((segments(floor), segments(upright))))
         self._labels = [shapes.label(f"ticks/{k}", anchor="center-right", visible=False) for k in range(MAX_TICKS)]

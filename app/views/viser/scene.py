@@ -13,6 +13,9 @@ from estimators.log import Events
 from ...live.outputs import Pull
 from ...present.drawing.colors import RGB
 
+SQUARE = np.array([[-1, -1], [1, -1], [1, 1], [-1, 1], [-1, -1]], float)
+"""Outline of the square from -1 to 1."""
+
 
 def ellipsoid(cov: np.ndarray, sigmas: float = 2.0) -> tuple[np.ndarray, tuple[float, float, float, float]]:
     """Return the ellipsoid x' cov⁻¹ x = sigmas², at that Mahalanobis distance, as a scaled and turned unit sphere.
