@@ -44,7 +44,7 @@ def channels(loaded: Loaded, section: Any, key: Key, model: StateSpaceModel) -> 
         index = {name: k for k, name in enumerate(known)}
         for name, item in given.items():
             place = (*key, group, name)
-            found.append((place, _channel(loaded, place, item, kind, index[name], name, known[name])))
+            found.append((place, channel_of(loaded, place, item, kind, index[name], name, known[name])))
     return found
 
 
@@ -58,13 +58,18 @@ def _cells(loaded: Loaded, key: Key, item: ChannelSection, field: Field, read: s
         column = f"{item.names()[0]}[{state.name.partition('[')[2]}"
         if column not in read:
             cell = item.model_copy(update={"columns": (column,)})
-            found.append((key, _channel(loaded, key, cell, TRUTH, k, state.name, [(state.name, state.unit)])))
+            found.append((key, channel_of(loaded, key, cell, TRUTH, k, state.name, [(state.name, state.unit)])))
     return found
 
 
-def _channel(
+def channel_of(
     loaded: Loaded, key: Key, item: ChannelSection, kind: int, index: int, name: str, rows: list[tuple[str, str]]
 ) -> Channel:
+    """Return the channel of one section, `key`, for these names and units of rows.
+
+    Raises:
+        ConfigError: With file and line, if a number of rows or a key does not fit.
+    """
     from sources.source import Accuracy, Channel
 
     names = item.names()

@@ -35,6 +35,7 @@ from .fmu import fmu_model
 from .landmarks import expanded
 from .learned import load_learned
 from .matrices import matrices_model
+from .sources.kind import signal_ends
 
 
 def find_model(loaded: Loaded, key: Key, reference: Model) -> StateSpaceModel:
@@ -357,9 +358,7 @@ def _ranged(items: Any, loaded: Loaded) -> Any:
 
 
 def _sensor(sensor: Any, loaded: Loaded) -> Any:
-    section = loaded.config.sensors.get(sensor.name)
-    if section is None:
-        return sensor
+    section = loaded.config.sensors.get(sensor.name, SensorSection())
     if section.correlation is not None:
         sensor = replace(sensor, correlation=_correlation(sensor, section.correlation, loaded))
     if section.variances is not None:
@@ -383,7 +382,7 @@ MAX_STUCK_RUN = 1e6
 
 
 def limits_of(sensor: Sensor, section: SensorSection, loaded: Loaded) -> Limits | None:
-    """Return the sensor's limits, replaced by those of the YAML.
+    """Return the sensor's limits, replaced by those of the YAML, with the ends of its signals by the DBC.
 
     Raises:
         ConfigError: With file and line, if a list does not fit the sensor's rows, or a rule can never apply.
@@ -398,6 +397,7 @@ def limits_of(sensor: Sensor, section: SensorSection, loaded: Loaded) -> Limits 
         stuck=stuck,
         duplicates=own.duplicates if section.duplicates is None else section.duplicates.within,
         rests=own.rests or section.rests,
+        ends=own.ends or signal_ends(sensor, loaded),
     )
     wrong = limits.flaw(len(sensor.rows))
     if wrong is None:

@@ -207,7 +207,7 @@ DETECTORS = (
     ),
     Detector(
         "stuck",
-        "{0.name} is stuck at {0.size:.6g}{0.spaced_unit} {0.since}: {0.observed_by}",
+        "{0.name} is {0.held} at {0.size:.6g}{0.spaced_unit} {0.since}: {0.observed_by}",
         "hold it out until it is repaired",
         statistic="repeated values",
         effect="the value",

@@ -260,7 +260,8 @@ class Limits:
     beyond is only a bound. rate: the largest change a second since the last measurement within all limits; noise may
     add `RATE_NOISE_STDS` standard deviations. duplicates: seconds after a measurement within which one of equal values
     is a copy of it; of the same time it always is. rests: whether the sensor may repeat its value for as long as it
-    likes: no detector takes it for stuck.
+    likes: no detector takes it for stuck. ends: the two ends of what its source can tell: a sensor that repeats one of
+    them, or one of `range` where that is given, is named saturated, not stuck.
     """
 
     range: tuple[Pair, ...] = ()
@@ -269,6 +270,7 @@ class Limits:
     stuck: Stuck | None = None
     duplicates: float = 0.0
     rests: bool = False
+    ends: tuple[tuple[float, ...], ...] = ()
 
     def __post_init__(self) -> None:
         """Reject limits that no measurement, or every one, would violate."""

@@ -16,8 +16,9 @@ from estimators.log import READING, Events
 
 from ..mapping import ABSENT, PRESENT, SHORT, ChannelMapping
 from ..source import Channel, Report, ignore
-from ..units import second_ns
-from .limits import Limits
+from ..units import declared_conversion, second_ns
+from ..worker_process import gist
+from .limits import Limits, span_of
 from .readers import EXTENDED, BusName, Raw
 from .signals import extract, ordered, tabulate, vectorises
 
@@ -318,7 +319,7 @@ def load_database(path: Path) -> Any:
     try:
         stamp = path.stat().st_mtime_ns
     except OSError as error:
-        raise SourceError(f"{path}: {error.strerror or error}; check the path of the DBC") from None
+        raise SourceError(f"{path}: {gist(error)}; check the path of the DBC") from None
     return _load(path, stamp)
 
 
@@ -331,8 +332,7 @@ def _load(path: Path, stamp: int) -> Any:
         # Not strict: signals of DBC files in use overlap, which is harmless where they are not read.
         database = cantools.database.load_file(path, strict=False)
     except (cantools.database.UnsupportedDatabaseFormatError, cantools.database.Error, OSError, ValueError) as error:
-        gist = " ".join(str(error).split())[:200]
-        raise SourceError(f"{path}: it cannot be read as a DBC ({gist}); check that it is one") from None
+        raise SourceError(f"{path}: it cannot be read as a DBC ({gist(error)}); check that it is one") from None
     finally:
         logger.setLevel(level)
     if not isinstance(database, cantools.database.can.Database):
@@ -382,3 +382,18 @@ def find_messages(databases: list[tuple[Path, BusName]], channel: Channel) -> tu
         known += [message.name for message in database.messages]
     files = ", ".join(path.name for path, _ in databases)
     raise SourceError(f"{files}: there is no message {name!r}; {nearest(name, known)}")
+
+
+def ends_of(databases: list[tuple[Path, BusName]], channel: Channel) -> tuple[tuple[float, ...], ...]:
+    """Return the two ends of each signal of a channel by the DBC, in the model's units.
+
+    Raises:
+        SourceError: If no database has it, or a unit does not convert.
+    """
+    message, found = find_messages(databases, channel)[0][0], []
+    for k, name in enumerate(channel.signals):
+        signal = message.get_signal_by_name(name)
+        factor, shift = declared_conversion(channel.units[k], signal.unit, channel.model_units[k], name)
+        ends = (channel.scale[k] * (factor * end + shift) + channel.offset[k] for end in span_of(signal)[:2])
+        found.append(tuple(ends))
+    return tuple(found)

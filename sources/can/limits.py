@@ -57,6 +57,21 @@ class Limits:
             values[i, j] = np.nan
 
 
+def span_of(signal: Any) -> tuple[float, float, bool]:
+    """Return the lowest and highest value of a signal (cantools), and whether these are the limits of the DBC.
+
+    Otherwise they are what its bits can express.
+    """
+    scale, offset, bits = float(signal.conversion.scale), float(signal.conversion.offset), signal.length
+    low, high = float(signal.minimum or 0.0), float(signal.maximum or 0.0)
+    raw = (-(1 << bits - 1), (1 << bits - 1) - 1) if signal.is_signed else (0, (1 << bits) - 1)
+    least, most = (-np.inf, np.inf) if signal.is_float else sorted(scale * end + offset for end in raw)
+    placeholder = (low, high) == raw and (scale, offset) != (1.0, 0.0)
+    if least - abs(scale) <= low < high <= most + abs(scale) and not placeholder:
+        return low, high, True
+    return least, most, False
+
+
 def _rules(message: Any, signal: Any) -> Iterator[tuple[float, float, str]]:
     """Yield intervals of missing values of a signal with their reasons; of those that overlap the last one counts."""
     scale, offset, bits = float(signal.conversion.scale), float(signal.conversion.offset), signal.length
@@ -66,11 +81,8 @@ def _rules(message: Any, signal: Any) -> Iterator[tuple[float, float, str]]:
         low, high = sorted((first * scale + offset, last * scale + offset))
         return low - slack, high + slack
 
-    low, high = float(signal.minimum or 0.0), float(signal.maximum or 0.0)
-    raw = (-(1 << bits - 1), (1 << bits - 1) - 1) if signal.is_signed else (0, (1 << bits) - 1)
-    least, most = (-np.inf, np.inf) if signal.is_float else interval(*raw)
-    placeholder = (low, high) == raw and (scale, offset) != (1.0, 0.0)
-    if least - slack <= low < high <= most + slack and not placeholder:
+    low, high, declared = span_of(signal)
+    if declared:
         text = f"outside {low:g} to {high:g}; the value is missing: correct the limits in the DBC if it is right"
         yield -np.inf, float(np.nextafter(low - slack, -np.inf)), text
         yield float(np.nextafter(high + slack, np.inf)), np.inf, text

@@ -5,6 +5,7 @@ from __future__ import annotations
 import glob
 import os
 from collections.abc import Callable, Sequence
+from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, TypeVar
@@ -12,11 +13,12 @@ from typing import TYPE_CHECKING, Any, TypeVar
 from config.loader import Loaded, shown_path
 from config.source_schema import CanLogSection, CanSection, RecordingSection, TableSection
 from config.yaml_files import Key, dotted
-from estimators.errors import SourceError
-from estimators.model.state_space import StateSpaceModel
+from estimators.errors import NisusError, SourceError
+from estimators.log import READING
+from estimators.model.state_space import Sensor, StateSpaceModel
 from sources.formats import BAG_FILE, TABLES, check_once, files_of, suffix_of
 
-from ..channels import channels
+from ..channels import channel_of, channels
 
 if TYPE_CHECKING:
     from sources.source import Channel, Report, Source
@@ -170,6 +172,23 @@ def find_databases(
             raise _absent(loaded, (*key, "dbc"), tried[0], section)
         found.append((path, item.channel))
     return found
+
+
+def signal_ends(sensor: Sensor, loaded: Loaded) -> tuple[tuple[float, ...], ...]:
+    """Return the two ends of each row's signal by the DBC, in the model's units; nothing without one.
+
+    A channel or DBC at fault has none: it is reported where the source is planned or opened.
+    """
+    source = loaded.config.source
+    for part in getattr(source, "parts", (source,)):
+        if isinstance(part, CanSection | CanLogSection) and sensor.name in part.sensors:
+            with suppress(NisusError):
+                from sources.can.decoder import ends_of
+
+                rows = [(row.name, row.unit) for row in sensor.rows]
+                channel = channel_of(loaded, (), part.sensors[sensor.name], READING, 0, sensor.name, rows)
+                return ends_of(find_databases(loaded, part, ()), channel)
+    return ()
 
 
 def failure(loaded: Loaded, key: Key, text: str, joint: str = " ") -> SourceError:

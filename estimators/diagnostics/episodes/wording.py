@@ -23,10 +23,15 @@ def spaced(unit: str) -> str:
 
 
 def observed_states(model: StateSpaceModel) -> np.ndarray:
-    """Return which states each sensor's measurement depends on at the prior, (sensors, nx) of bool."""
+    """Return which states each sensor's measurement depends on at the prior, (sensors, nx) of bool.
+
+    None of a model with more than `MAX_STATES`, or with a function of its own in place of equations.
+    """
+    observed = np.zeros((len(model.sensors), model.nx), bool)
+    if model.nx > MAX_STATES or model.black_box:
+        return observed
     compiled = compile_model(indicator(model))
     x0, u, p = model.prior_mean.copy(), model.default_inputs, model.default_parameters
-    observed = np.zeros((len(model.sensors), model.nx), bool)
     for s, sensor in enumerate(model.sensors):
         y, moved = np.empty(len(sensor.rows)), np.empty(len(sensor.rows))
         compiled.h[s](x0, u, p, y)
@@ -111,8 +116,6 @@ class SensorFacts(EpisodeFacts):
     def process_noise(self) -> str:
         """Tuning keys of the process noises that act on the states which the sensor observes."""
         model = self.model
-        if model.nx > MAX_STATES or model.black_box:
-            return "Q"
         observed = set(np.flatnonzero(observed_states(model)[self.s]).tolist())
         names = [noise.name for noise in model.noises if set(model.acts_on(noise.name)) & observed]
         return " or ".join(f"Q.{name}" for name in names[:3]) or "Q"
@@ -126,15 +129,20 @@ class SensorFacts(EpisodeFacts):
     @property
     def observed_by(self) -> str:
         """Whether other sensors observe the same states."""
-        model, only = self.model, []
-        if model.nx <= MAX_STATES and not model.black_box:
-            observed = observed_states(model)
-            others = np.delete(observed, self.s, axis=0).any(axis=0)
-            only = [model.state_names[int(j)] for j in np.flatnonzero(observed[self.s] & ~others)][:4]
+        observed = observed_states(self.model)
+        others = np.delete(observed, self.s, axis=0).any(axis=0)
+        only = [self.model.state_names[int(j)] for j in np.flatnonzero(observed[self.s] & ~others)][:4]
         if not only:
             return "other sensors measure the same states"
         named = f"{', '.join(only[:-1])} and {only[-1]}" if only[1:] else only[0]
         return f"{named} {'is' if len(only) == 1 else 'are'} measured by no other sensor"
+
+    @property
+    def held(self) -> str:
+        """Why a sensor repeats its value: it is stuck, or saturated at an end of what it can measure."""
+        limits = self.model.sensors[self.s].limits
+        ends = (limits.range or limits.ends) if limits else ()
+        return "saturated" if ends and np.isclose(ends[(self.k or 0) % len(ends)], self.size).any() else "stuck"
 
     @property
     def cross_check(self) -> str:

@@ -174,7 +174,7 @@ def test_the_nees_is_that_of_the_python_interface(tmp_path, nisus):
 def stuck_drive(tmp_path):
     """200 readings, one a second, of which the last 100 are equal."""
     y = 40.0 + np.random.default_rng(5).normal(0, 2, 200)
-    y[100:] = 41.5
+    y[100:] = 46.5
     return drive(tmp_path, "t,y\n" + "".join(f"{k},{value}\n" for k, value in enumerate(y)), BARE)
 
 
@@ -182,10 +182,11 @@ def test_episodes_are_printed_told_to_scripts_and_kept(tmp_path, nisus):
     twin, out = str(stuck_drive(tmp_path)), tmp_path / "track.parquet"
     lines = nisus("fold", twin, "--out", out).out.splitlines()
     assert any(line.startswith("1 episode(s); docs/alarms.md") for line in lines)
-    assert "stuck, at the end: winding is stuck at 41.5 °C since 100.0 s" in " ".join(" ".join(lines[-3:]).split())
+    assert "stuck, at the end: winding is stuck at 46.5 °C since 100.0 s" in " ".join(" ".join(lines[-3:]).split())
+    assert "winding is saturated at 46.5" in nisus("fold", twin, "--set", "sensors.winding.range=[0, 46.5]").out
     (episode,) = nisus("fold", twin, "--json").json["episodes"]
     assert {key: episode[key] for key in ("start", "end", "subject", "cause", "size", "low", "high", "unit")} == {
-        "start": 100.0, "end": None, "subject": "winding", "cause": "stuck", "size": 41.5, "low": None, "high": None,
+        "start": 100.0, "end": None, "subject": "winding", "cause": "stuck", "size": 46.5, "low": None, "high": None,
         "unit": "°C",
     }  # fmt: skip
     table = pq.read_table(out)

@@ -13,6 +13,7 @@ from app.cli.fold import fold_twin
 from app.live.alerts import rejections
 from app.live.counts import RowCounts
 from app.live.fold_json import base_from_json, base_to_json
+from app.twin.twin import load_twin
 from estimators.errors import ConfigError
 from estimators.fold import Fold
 from estimators.log import Log
@@ -60,6 +61,9 @@ def limited(limits, more=""):
 )
 def test_limits_reach_the_sensor(limits, expected):
     assert twin_of(limited(limits)).model.sensors[0].limits == expected
+    fahrenheit = {"source.sensors.winding": "{message: THERMAL, signals: WindingTemp, scale: 2, offset: 1, units: K}"}
+    (ends,) = load_twin("motor_can", overrides=fahrenheit).model.sensors[0].limits.ends
+    assert ends == pytest.approx((2 * (-50 - 273.15) + 1, 2 * (605.35 - 273.15) + 1))
 
 
 def test_a_range_of_validity_takes_the_place_of_the_models():

@@ -10,7 +10,7 @@ import pytest
 
 from estimators.errors import SourceError
 from estimators.log import INPUT, READING, TRUTH
-from sources.can.decoder import Decoder
+from sources.can.decoder import Decoder, ends_of
 from sources.source import Accuracy, Channel, Condition
 from tests.sources.can.can_tools import Reports, dbc, frame, sensor
 
@@ -324,11 +324,10 @@ def test_values_that_the_dbc_or_j1939_excludes_are_missing_and_named(tmp_path, r
     lines += [f"VAL_ 2147484160 S {row['names']} ;"] * bool(row["names"])
     lines += ['BA_DEF_ "ProtocolType" STRING ;', 'BA_ "ProtocolType" "J1939";'] * bool(row["j1939"])
     path, reports = dbc(tmp_path, "\n".join(lines) + "\n"), Reports()
-    decoder = Decoder([(path, None)], [sensor(0, "A", "S")], width=1, report=reports)
+    channel = sensor(0, "A", "S", scale=(0.5,), offset=(1.0,))
+    assert ends_of([(path, None)], channel) == (tuple(0.5 * float(end) + 1.0 for end in row["ends"].split()),)
+    decoder = Decoder([(path, None)], [channel], width=1, report=reports)
     data = int(row["raw"]).to_bytes(8, "little")
     (value,) = decoder.decode(decoder.gather([frame(512, data, extended=True)], None)).value[:, 0]
-    np.testing.assert_equal(value, float(row["value"] or "nan"))
-    assert (reports.counts["no value A.S"], row["why"] in reports.texts.get("no value A.S", "")) == (
-        not row["value"],
-        True,
-    )
+    np.testing.assert_equal(value, 0.5 * float(row["value"] or "nan") + 1.0)
+    assert reports.counts["no value A.S"] == (not row["value"]) and row["why"] in str(reports.texts)
