@@ -294,7 +294,7 @@ class ChannelMapping:
             source, kind, channel, value = source[:n], kind[:n].copy(), channel[:n].copy(), value[:n].copy()
         batch = Events(t[source], arrival[source], kind, channel, value)
         if np.count_nonzero(self._counts):
-            self._report_losses(*self._losses)
+            self._report_losses()
             self._counts[:] = 0
         for thinned in self._thinned.values():
             new = self._new(batch, thinned, None if assets is None else assets[source])
@@ -303,23 +303,19 @@ class ChannelMapping:
             self._place(batch, item)
         return batch, source
 
-    def _report_losses(self, refused: np.ndarray, cut: np.ndarray, unreported: np.ndarray, unknown: np.ndarray) -> None:
-        for k, channel in enumerate(self._channels):
+    def _report_losses(self) -> None:
+        for channel, counts in zip(self._channels, self._counts.T, strict=True):
             name, own = channel.name, channel.accuracy
             rule = " and ".join(map(str, channel.where))
             reported = ", ".join(dict.fromkeys(own.signals)) if own is not None else ""
             what = "variance" if own is not None and own.squared else "standard deviation"
-            ends = f"a frame of {channel.message} ends before {', '.join(channel.signals)}"
-            for count, key, text in (
-                (refused[k], "condition", f"measurement rejected; it needs {rule}"),
-                (cut[k], "short frame", ends),
-                (unreported[k], "accuracy", f"{reported} has no positive {what} of a measurement; the tuned R is used"),
-                (
-                    unknown[k],
-                    "unknown accuracy",
-                    f"{reported} is no number, negative or too large for a {what}; value is missing",
-                ),
-            ):
+            losses = {  # In the order of the counts
+                "condition": f"measurement rejected; it needs {rule}",
+                "short frame": f"a frame of {channel.message} ends before {', '.join(channel.signals)}",
+                "accuracy": f"{reported} has no positive {what} of a measurement; the tuned R is used",
+                "unknown accuracy": f"{reported} is no number, negative or too large for a {what}; value is missing",
+            }
+            for count, (key, text) in zip(counts, losses.items(), strict=True):
                 for _ in range(count):
                     self._report(f"{key} {name}", f"{name}: {text}")
 

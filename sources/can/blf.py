@@ -1,23 +1,29 @@
 """Frames of a BLF log by columns (python-can makes an object of each frame: 2 µs).
 
-python-can reads the blocks and decompresses them. A block of CAN messages alone is then read as one array; a block with
-other frames (CAN FD, errors), or with anything unusual, is left to python-can, so faults are found and named as before.
+A block of CAN messages alone is read as one array; a block with other frames (CAN FD, errors), or with anything
+unusual, is left to python-can. A block that cannot be read is counted with its place, and the next one is looked for.
 """
 
 from __future__ import annotations
 
+import os
+import re
+import zlib
 from collections.abc import Iterator
-from typing import Any, NamedTuple
+from typing import Any
 
 import can
 import numpy as np
+from can.io.blf import LOG_CONTAINER, LOG_CONTAINER_STRUCT, NO_COMPRESSION, OBJ_HEADER_BASE_STRUCT
 
 from ..units import to_ns
+from .readers import Raw, refused
 
 KEY_BITS, REMOTE_FLAG = 0x9FFFFFFF, 0x80  # The highest bit of an id is that of an extended frame, as in `EXTENDED`.
 CAN_MESSAGE, CAN_MESSAGE2 = 1, 86
 SLOW_TYPES = (73, 100, 101)  # Error frames and CAN FD, left to python-can
-MARK = np.frombuffer(b"LOBJ", np.uint8)  # Begin of an object
+HEAD, MARK = OBJ_HEADER_BASE_STRUCT, b"LOBJ"  # Begin of an object
+BLOCK = re.compile(MARK + b".{8}" + LOG_CONTAINER.to_bytes(4, "little"), re.DOTALL)  # Begin of a compressed one
 MAX_EXACT = 2**53  # Times up to here are exact as float64
 
 _BASE = [("mark", "S4"), ("head", "<u2"), ("version", "<u2"), ("size", "<u4"), ("type", "<u4"), ("flags", "<u4")]
@@ -29,38 +35,67 @@ LAYOUTS = {
 """Layout of a CAN message by the version of its header."""
 
 
-class FrameBlock(NamedTuple):
-    """Data frames of a block, as columns: times (ns), ids (EXTENDED added to extended ones), buses, lengths, bytes.
-
-    The bytes (n, 8) are zero beyond the length. `total` counts the remote frames too.
-    """
-
-    t: np.ndarray
-    key: np.ndarray
-    bus: np.ndarray
-    length: np.ndarray
-    data: np.ndarray
-    total: int
-
-
 class BlfBlocks(can.BLFReader):
-    """python-can's reader, whose items are a `FrameBlock` where that is possible, otherwise its messages."""
+    """python-can's reader, whose items are the frames of a block as `Raw` where possible, otherwise its messages."""
 
     _tail: bytes
+    bad = 0
+    """Blocks that could not be read."""
+    fault = ""
+
+    def __iter__(self) -> Iterator[Any]:
+        begin = self.file.tell()
+        while data := self.file.read(HEAD.size):
+            place, error = self.file.tell() - len(data), None
+            try:
+                mark, _, _, size, kind = HEAD.unpack(data)
+                if mark != MARK:
+                    raise ValueError("no block begins here")
+                begin = place
+                content = self.file.read(max(0, size - HEAD.size))
+                self.file.read(size % 4)
+                if kind == LOG_CONTAINER:
+                    packed = LOG_CONTAINER_STRUCT.unpack_from(content)[0] != NO_COMPRESSION
+                    content = content[LOG_CONTAINER_STRUCT.size :]
+                    yield from self._parse_container(zlib.decompressobj().decompress(content) if packed else content)
+                if self.file.tell() == place + size + size % 4:
+                    continue
+            except Exception as wrong:  # noqa: BLE001  a damaged file makes python-can raise anything
+                error = wrong
+            # A wrong length may have passed over blocks; that of the last one of a file that is cut has none after it.
+            if self._seek_block(begin + len(MARK)) or error:
+                self._tail = b"" if error else self._tail
+                self.bad += 1
+                self.fault = refused(self.fault, self.bad, "block", f"at byte {place}", error or "its length is wrong")
+
+    def _seek_block(self, place: int) -> bool:
+        """Move to the first block from a place on, or to the end; return whether there is one."""
+        self.file.seek(place)
+        while len(part := self.file.read(2**20)) >= HEAD.size:
+            if found := BLOCK.search(part):
+                self.file.seek(found.start() - len(part), os.SEEK_CUR)
+                return True
+            self.file.seek(1 - HEAD.size, os.SEEK_CUR)
+        return False
 
     def _parse_container(self, data: bytes) -> Iterator[Any]:
-        joined = self._tail + data if self._tail else data
+        # After a block that could not be read, an object of it may end here.
+        joined = self._tail + data if self._tail else data[max(0, data.find(MARK)) :]
         found = frames_of(joined, self.start_timestamp)
         if found is None:
-            yield from super()._parse_container(data)
+            self._tail = b""
+            yield from super()._parse_container(joined)
             return
         block, end = found
         self._tail = joined[end:]
         yield block
 
 
-def frames_of(data: bytes, start: float) -> tuple[FrameBlock, int] | None:
+def frames_of(data: bytes, start: float) -> tuple[Raw, int] | None:
     """Return the CAN messages of a block and where its last whole object ends; None if python-can must read it.
+
+    Numbers of buses stand in place of positions; the bytes (n, 8) are zero beyond the length; the total counts the
+    remote frames too.
 
     Args:
         data: The block, decompressed, after what the one before it left over.
@@ -70,7 +105,7 @@ def frames_of(data: bytes, start: float) -> tuple[FrameBlock, int] | None:
     if content.size < 64:
         return None
     places = np.flatnonzero(content[:-15] == MARK[0])
-    places = places[(content[places[:, None] + np.arange(1, 4)] == MARK[1:]).all(axis=1)]
+    places = places[(content[places[:, None] + np.arange(1, 4)] == list(MARK[1:])).all(axis=1)]
     if not places.size:
         return None
     sizes = content[places[:, None] + np.arange(8, 12)].view("<u4")[:, 0].astype(np.int64)
@@ -104,12 +139,13 @@ def frames_of(data: bytes, start: float) -> tuple[FrameBlock, int] | None:
     # As python-can rounds: first the product with 1e-5 or 1e-9, exact before it is rounded, then the sum.
     seconds = frames["time"] / np.where(frames["flags"] == 1, 1e5, 1e9) + start
     length = np.minimum(frames["dlc"], 8).astype(np.int64)
-    block = FrameBlock(
+    block = Raw(
         to_ns(seconds),
         (frames["id"] & KEY_BITS).astype(np.int64),
         frames["channel"].astype(np.int64) - 1,
         length,
         np.where(np.arange(8) < length[:, None], frames["data"], 0).astype(np.uint8),
+        (),
         total,
     )
     return block, end

@@ -58,9 +58,9 @@ class Limits:
 
 
 def span_of(signal: Any) -> tuple[float, float, bool]:
-    """Return the lowest and highest value of a signal (cantools), and whether these are the limits of the DBC.
+    """Return the lowest and highest value of a signal (cantools), and whether these are by the limits of the DBC.
 
-    Otherwise they are what its bits can express.
+    Otherwise they are those that its bits can express.
     """
     scale, offset, bits = float(signal.conversion.scale), float(signal.conversion.offset), signal.length
     low, high = float(signal.minimum or 0.0), float(signal.maximum or 0.0)
@@ -68,7 +68,7 @@ def span_of(signal: Any) -> tuple[float, float, bool]:
     least, most = (-np.inf, np.inf) if signal.is_float else sorted(scale * end + offset for end in raw)
     placeholder = (low, high) == raw and (scale, offset) != (1.0, 0.0)
     if least - abs(scale) <= low < high <= most + abs(scale) and not placeholder:
-        return low, high, True
+        return max(low, least), min(high, most), True
     return least, most, False
 
 

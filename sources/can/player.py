@@ -18,6 +18,7 @@ from ..source import Channel, Report, Source, ignore
 from ..units import declared_conversion
 from .bus import open_bus
 from .decoder import BusName, find_messages
+from .limits import span_of
 
 INPUT_REPEAT_NS = 1_000_000_000  # ns after which an unchanged input is sent again
 
@@ -144,7 +145,7 @@ class _Frame:
         self.message = message
         self.values: dict[str, float] = {}
         for signal in message.signals:
-            low, high = _range(signal)
+            low, high, _ = span_of(signal)
             start = signal.initial if isinstance(signal.initial, (int, float)) else 0.0
             self.values[signal.name] = min(max(float(start), low), high)
         self.known: set[str] = set()
@@ -163,20 +164,6 @@ class _Frame:
             data=data,
             check=True,
         )
-
-
-def _range(signal: Any) -> tuple[float, float]:
-    """Return the range of a signal: that of its bits, within the one that the DBC declares."""
-    if signal.is_float:
-        bits = (-math.inf, math.inf)
-    else:
-        top = 2 ** (signal.length - 1) if signal.is_signed else 2**signal.length
-        raw = (-top if signal.is_signed else 0, top - 1)
-        bits = tuple(sorted(r * signal.conversion.scale + signal.conversion.offset for r in raw))
-    low, high = signal.minimum, signal.maximum
-    if low is None or high is None or not low < high:
-        return bits
-    return max(bits[0], float(low)), min(bits[1], float(high))
 
 
 class Encoder:
@@ -220,11 +207,11 @@ class Encoder:
                 slope = channel.scale[k] * factor
                 if slope == 0.0:
                     raise SourceError(f"{where}: scale is 0; it must differ from 0")
-                rows.append((name, slope, channel.scale[k] * shift + channel.offset[k], *_range(signal)))
+                rows.append((name, slope, channel.scale[k] * shift + channel.offset[k], *span_of(signal)[:2]))
                 frame.wanted.add(name)
             for condition in channel.where:
                 signal = message.get_signal_by_name(condition.signal)
-                low, high = _range(signal)
+                low, high, _ = span_of(signal)
                 frame.values[condition.signal] = min(max(0.0, condition.low, low), condition.high, high)
             self._routes[channel.kind, channel.index] = (frame, rows)
 

@@ -13,7 +13,7 @@ from contextlib import suppress
 from io import TextIOWrapper
 from itertools import islice
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -22,9 +22,6 @@ from estimators.errors import SourceError
 from ..formats import suffix_of
 from ..units import second_ns
 from ..worker_process import gist
-
-if TYPE_CHECKING:
-    from .blf import FrameBlock
 
 FIRST_CHUNK_FRAMES = 256  # Frames of the first chunk, so that it arrives at once
 MAX_TIME_S = 2.0**62 / 1e9  # Distance of a valid time from 1970, s
@@ -58,7 +55,7 @@ def read_messages(path: Path, wanted: frozenset[int] | None, longest: int) -> It
     """
     import can
 
-    from .blf import BlfBlocks, FrameBlock
+    from .blf import BlfBlocks
 
     _correct_readers()
     warned = _Warnings()
@@ -78,20 +75,18 @@ def read_messages(path: Path, wanted: frozenset[int] | None, longest: int) -> It
         size = FIRST_CHUNK_FRAMES
         while True:
             chunk: list[Any] = []
-            block: FrameBlock | None = None
+            block: Raw | None = None
             try:
                 # One by one, so that frames before the fault are kept.
                 for message in islice(messages, size):
-                    if isinstance(message, FrameBlock):
+                    if isinstance(message, Raw):
                         block = message
                         break
                     chunk.append(message)
             except SourceError:
                 raise
             except Exception as error:  # noqa: BLE001  as above
-                fault = gist(error) + (
-                    f" before byte {reader.file.tell()}" if isinstance(reader, can.BLFReader) else ""
-                )
+                fault = gist(error)
             count += len(chunk)
             errors += sum(message.is_error_frame for message in chunk)
             if chunk or block is None:
@@ -104,7 +99,12 @@ def read_messages(path: Path, wanted: frozenset[int] | None, longest: int) -> It
             elif fault or len(chunk) < size:
                 break
             size = CHUNK_FRAMES
-        fault = fault or (lines.fault if lines is not None else "") or warned.fault or _missing_end(path, reader)
+        fault = (
+            fault
+            or getattr(reader if lines is None else lines, "fault", "")
+            or warned.fault
+            or _missing_end(path, reader)
+        )
         if broken:
             fault = fault or f"{broken} frames hold no numbers"
     finally:
@@ -198,12 +198,17 @@ class _Lines:
         """Count the last line as unreadable."""
         self.bad += 1
         self._empty = True
-        first = self.fault.partition(", the first")[2] or f" line {self.number}: {' '.join(str(error).split())[:100]}"
-        self.fault = f"{self.bad} line{'s' if self.bad > 1 else ''} cannot be read, the first{first}"
+        self.fault = refused(self.fault, self.bad, "line", f"line {self.number}", error)
 
     def close(self) -> None:
         """Close the file."""
         self._file.close()
+
+
+def refused(before: str, count: int, what: str, place: str, error: object) -> str:
+    """Return the fault of a file of which so many lines or blocks cannot be read, this one last; `before` it was."""
+    first = before.partition(", the first")[2] or f" {place}: {gist(error)}"
+    return f"{count} {what}{'s' if count > 1 else ''} cannot be read, the first{first}"
 
 
 def _by_lines(path: Path, reader: Any, lines: _Lines) -> Iterator[Any]:
@@ -300,7 +305,7 @@ def _columns(
 
 
 def _selected(
-    block: FrameBlock,
+    block: Raw,
     wanted: frozenset[int] | None,
     longest: int,
     buses: dict[BusName, int],

@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from math import ceil
+from typing import Any
 
 import numpy as np
 
@@ -131,13 +132,15 @@ class Moment:
 class Effect:
     """Effect of a fault on the events of its target, in their order of arrival; by default none.
 
-    `lost` counts removed events. `last` is the last value of the target, if that is an input.
+    `lost` counts removed events. `last` is the last value of the target, if that is an input. `_kept` is what some
+    effects keep of earlier events, by kind and channel.
     """
 
     def __init__(self, kind: str, target: Target, given: dict[str, float], rng: np.random.Generator) -> None:
         self._kind, self._target, self._given, self._rng = kind, target, given, rng
         self.lost = 0
         self.last: float | None = None
+        self._kept: dict[tuple[int, int], Any] = {}
 
     def apply(self, item: FaultedEvent, moment: Moment) -> list[FaultedEvent]:
         """Return the events in place of one event."""
@@ -190,20 +193,16 @@ class ValueEffect(Effect):
     scheduled fault do not depend on its end, and a fault on one row leaves those of the others.
     """
 
-    def __init__(self, kind: str, target: Target, given: dict[str, float], rng: np.random.Generator) -> None:
-        super().__init__(kind, target, given, rng)
-        self._held: dict[tuple[int, int], np.ndarray] = {}
-
     def apply(self, item: FaultedEvent, moment: Moment) -> list[FaultedEvent]:
         """Return the event with changed values."""
         cells = self._target.cells(item)
         y = item.value[cells]
         hit = self._hit(moment)
         draw = self._rng.standard_normal(y.size) if moment.draws else np.zeros(y.size)
-        held = self._held.get((item.kind, item.channel))
+        held = self._kept.get((item.kind, item.channel))
         if not moment.during or held is None:
             held = y if held is None else np.where(np.isnan(y), held, y)
-            self._held[item.kind, item.channel] = held
+            self._kept[item.kind, item.channel] = held
         if not moment.during:
             return [item]
         changed = self._changed(y, held, moment.since / 1e9, hit, draw)
@@ -271,10 +270,6 @@ class TimeEffect(Effect):
 
 class Reorder(Effect):
     """Holds an event back until the next one of its kind and channel, and delivers it after that."""
-
-    def __init__(self, kind: str, target: Target, given: dict[str, float], rng: np.random.Generator) -> None:
-        super().__init__(kind, target, given, rng)
-        self._kept: dict[tuple[int, int], FaultedEvent] = {}
 
     def apply(self, item: FaultedEvent, moment: Moment) -> list[FaultedEvent]:
         """Return nothing, the event, or the event and the one before it."""

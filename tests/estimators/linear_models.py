@@ -276,3 +276,13 @@ def close(actual: np.ndarray, expected: np.ndarray, what: str, tolerance: float 
     scale = max(1e-3, float(np.max(np.abs(expected))))
     error = float(np.max(np.abs(np.asarray(actual) - expected))) / scale
     assert error < tolerance, f"{what}: off by {error:.1e} of {scale:.3g}"
+
+
+def kalman(mean, P, H, offset, R, y):
+    """Mean, covariance, NIS, log-likelihood and √diag S of N(mean, P) given a reading y = H x + offset + N(0, R)."""
+    S = H @ P @ H.T + R
+    K = P @ H.T @ np.linalg.inv(S)
+    nu = y - H @ mean - offset
+    nis = nu @ np.linalg.solve(S, nu)
+    log_likelihood = -0.5 * (nis + np.linalg.slogdet(S)[1] + nu.size * np.log(2 * np.pi))
+    return mean + K @ nu, P - K @ S @ K.T, nis, log_likelihood, np.sqrt(np.diag(S))

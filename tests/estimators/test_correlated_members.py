@@ -14,7 +14,7 @@ from estimators.model.parts import covariance_of
 from estimators.models.lorenz import LORENZ96
 from estimators.registry import ESTIMATORS, checked
 from estimators.tuning import Tuning
-from tests.estimators.linear_models import random_linear
+from tests.estimators.linear_models import kalman, random_linear
 from tests.models import level_model
 from tests.support import log_of
 
@@ -39,13 +39,7 @@ def rows_there(there):
 
 def update(mean, P, there):
     """Mean, covariance, NIS, log-likelihood and √diag S of N(mean, P) given the rows that are there."""
-    h = H[there]
-    S = h @ P @ h.T + R[np.ix_(there, there)]
-    K = P @ h.T @ np.linalg.inv(S)
-    nu = Y[there] - h @ mean - OFFSET[there]
-    nis = nu @ np.linalg.solve(S, nu)
-    log_likelihood = -0.5 * (nis + np.linalg.slogdet(S)[1] + nu.size * np.log(2 * np.pi))
-    return mean + K @ nu, P - K @ S @ K.T, nis, log_likelihood, np.sqrt(np.diag(S))
+    return kalman(mean, P, H[there], OFFSET[there], R[np.ix_(there, there)], Y[there])
 
 
 @pytest.mark.parametrize("there", THERE)

@@ -164,18 +164,6 @@ def test_noise_that_depends_on_the_state_is_each_particles_own(name):
     assert abs(track.std[1, 0] ** 2 / (0.25 + 0.3 * 4.25) - 1) < 5 * np.sqrt(3 / 1e5)
 
 
-@pytest.mark.parametrize("name", NAMES)
-def test_queries_change_no_draw(name):
-    model = scalar()
-    tuning = Tuning.of(model).with_options({"particles": 200})
-    plain = fold(name, model, tuning, log_of(1, (0, READING, 2.1), (1, READING, 2.4), (2, READING, 2.2)))
-    asked = fold(
-        name, model, tuning,
-        log_of(1, (0, READING, 2.1), (0.5, TICK, 0), (0.9, TICK, 0), (1, READING, 2.4), (2, READING, 2.2)),
-    )  # fmt: skip
-    assert np.array_equal(plain.mean, asked.mean[[0, 3, 4]])
-
-
 def test_the_kernel_widens_the_cloud_by_its_bandwidth():
     model = scalar(noises=(Noise("s", "m²/s", 0.0),))
     log = log_of(1, (0, READING, 2.3), (1, TICK, 0))
@@ -236,7 +224,7 @@ def test_a_cloud_that_explains_nothing_fails_visibly_and_recovers(name):
 
 
 @pytest.mark.parametrize("name", NAMES)
-def test_a_reading_without_a_value_changes_nothing(name):
+def test_a_reading_without_a_value_and_a_question_change_nothing(name):
     """Nor how often the filter drew: what comes after it has its bits as before. It is the last of its time."""
     model = scalar()
     tuning = Tuning.of(model).with_options({"particles": 200})
@@ -248,6 +236,8 @@ def test_a_reading_without_a_value_changes_nothing(name):
     assert list(missed.verdict) == [USED, USED, MISSING, USED, MISSING]
     assert np.array_equal(plain.mean[[0, 1, 1, 2, 2]], missed.mean)
     assert np.array_equal(plain.log_likelihood, missed.log_likelihood[[0, 1, 3]])
+    questions = (0, READING, 2.1), (0.5, TICK, 0), (0.9, TICK, 0), (1, READING, 2.4), (2, READING, 2.2)
+    assert np.array_equal(plain.mean, fold(name, model, tuning, log_of(1, *questions)).mean[[0, 3, 4]])
 
 
 @pytest.mark.parametrize(("key", "value", "verdict"), [("gate", 0.999, GATED), ("use.y", False, HELD_OUT)])
