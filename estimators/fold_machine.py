@@ -147,7 +147,7 @@ class Machine:
         numbers = self.estimator.state_size(self.options, model.nx) + self.estimator.memory(self.options, model)
         return Snapshot(
             clock=np.array([UNSET]),
-            u=np.array([item.default for item in model.inputs], float),
+            u=model.default_inputs.copy(),
             state=np.empty(numbers),
             evidence=fresh(model),
             edge=fresh_screen(model),

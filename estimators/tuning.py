@@ -83,7 +83,7 @@ class Tuning:
             model=model,
             q=np.array([noise.variance for noise in model.noises], float),
             r=np.array([row.variance for sensor in model.sensors for row in sensor.rows], float),
-            p=np.array([parameter.value for parameter in model.parameters], float),
+            p=model.default_parameters.copy(),
             used=np.ones(len(model.sensors), bool),
         )
 

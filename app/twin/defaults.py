@@ -78,11 +78,9 @@ def degraded_after(
 def _slowest(model: StateSpaceModel) -> float | None:
     if model.black_box or model.nx > MAX_STATES:
         return None
-    u = np.array([item.default for item in model.inputs], float)
-    p = np.array([item.value for item in model.parameters], float)
-    dt = min(model.max_step, 1.0)
+    p, dt = model.default_parameters, min(model.max_step, 1.0)
     try:
-        constants = time_constants(jacobian(model, model.prior_mean.copy(), u, p, dt), dt)
+        constants = time_constants(jacobian(model, model.prior_mean.copy(), model.default_inputs, p, dt), dt)
     except ModelError:
         return None
     return float(constants[0]) if constants.size else None

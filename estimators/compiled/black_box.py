@@ -125,8 +125,8 @@ class BlackBox:
         """
         model = self.model
         X = model.prior_mean + np.array([[0.0], [0.1], [-0.1]]) * model.prior_std
-        u = np.array([item.default for item in model.inputs], float)
-        p = np.array([item.value for item in model.parameters], float)
+        u = model.default_inputs.copy()
+        p = model.default_parameters.copy()
         dt = min(1.0, model.max_step)
         calls: list[tuple[str, Callable[[np.ndarray], np.ndarray]]] = [("f", lambda X: self.f(X, u, p, dt))]
         for k, sensor in enumerate(model.sensors):

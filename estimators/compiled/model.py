@@ -266,16 +266,14 @@ def _varies(model: StateSpaceModel) -> bool:
     if model.Q is None:
         return False
     rng = np.random.default_rng(0)
-    u = np.array([item.default for item in model.inputs], float)
-    p = np.array([item.value for item in model.parameters], float)
+    u = model.default_inputs.copy()
+    p = model.default_parameters.copy()
     q = np.array([max(noise.variance, 1e-12) for noise in model.noises], float)
-    mean = np.array([state.mean for state in model.states], float)
-    std = np.array([state.std for state in model.states], float)
     found = []
     with np.errstate(all="ignore"):
         for spread in [0.0] + [1.0, 5.0] * 16:
             out = np.zeros((model.nx, model.nx))
-            x = mean + spread * std * rng.standard_normal(model.nx)
+            x = model.prior_mean + spread * model.prior_std * rng.standard_normal(model.nx)
             plain(model.Q)(x, u, p, q, min(1.0, model.max_step), out)
             found.append(out)
     return any(not np.array_equal(found[0], other, equal_nan=True) for other in found[1:])
@@ -285,8 +283,8 @@ def _check_derivatives(compiled: CompiledModel) -> None:
     """Compare Jacobians with central differences; reject analytic ones that differ, and replace complex steps."""
     model, static = compiled.model, compiled.static
     rng = np.random.default_rng(0)
-    u = np.array([item.default for item in model.inputs], float)
-    p = np.array([item.value for item in model.parameters], float)
+    u = model.default_inputs.copy()
+    p = model.default_parameters.copy()
     std = model.prior_std
     dt = min(0.1, model.max_step)
     scratch = np.empty(scratch_size(model.nx, model.width))

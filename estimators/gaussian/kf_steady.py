@@ -174,7 +174,7 @@ def tune(values: Options, model: StateSpaceModel, tuning: Tuning) -> np.ndarray:
     from scipy.linalg import solve_discrete_are
 
     period, rate = values["period"], float(np.log(values["inflation"]))
-    u = np.array([item.default for item in model.inputs], float)
+    u = model.default_inputs
     steps = steps_of(period, float(model.max_step))
     F, Q, H = matrices(model, u, tuning.p, tuning.q, period, rate)
     R = covariance_of(model.sensors[0].correlation, np.asarray(tuning.r, float))
@@ -227,7 +227,7 @@ def matrices(
             j = model.state_names.index(noise.name)
             Q[j, j] += variance * dt
     else:
-        _plain(model.Q)(np.array([state.mean for state in model.states], float), u, p, q, dt, Q)
+        _plain(model.Q)(model.prior_mean.copy(), u, p, q, dt, Q)
     F *= np.exp(0.5 * rate * dt)
     total_F, total_Q = np.eye(n), np.zeros((n, n))
     for _ in range(steps):
@@ -286,9 +286,9 @@ def applies(model: StateSpaceModel) -> str | None:
             f"{model.name} has {len(model.sensors)} sensors, each at times of its own: no one steady state; make them "
             "rows of one sensor, or use kf"
         )
-    p = np.array([item.value for item in model.parameters], float)
+    p = model.default_parameters
     q = np.array([noise.variance for noise in model.noises], float)
-    u = np.array([item.default for item in model.inputs], float)
+    u = model.default_inputs
     period = min(1.0, model.max_step)
     here = matrices(model, u, p, q, period)
     for there in (matrices(model, u + shift, p, q, period) for shift in (1.0, -0.7) if u.size):

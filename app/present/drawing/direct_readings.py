@@ -43,8 +43,7 @@ def observed(model: StateSpaceModel) -> list[Observed]:
     charted, places = model.shown.tolist(), points[:, model.shown]
     units = np.array([state.unit for state in model.shown_states])
     sizes = np.array([state.std or 1.0 for state in model.shown_states])  # of one that is certain at first, in its unit
-    u = np.array([item.default for item in model.inputs])
-    p = np.array([parameter.value for parameter in model.parameters])
+    u, p = model.default_inputs, model.default_parameters
     found = []
     for k, sensor in enumerate(model.sensors):
         values, there = np.full((len(points), len(sensor.rows)), np.nan), np.zeros(len(sensor.rows))
@@ -83,7 +82,7 @@ def measured_by(model: StateSpaceModel) -> dict[str, list[str]]:
 def expected(model: StateSpaceModel, sensor: Sensor, x: np.ndarray, p: np.ndarray) -> np.ndarray:
     """Return h(x, u, p) of a sensor with the inputs' defaults, shape (ny,); NaN where it fails."""
     out = np.full(len(sensor.rows), np.nan)
-    _expect(model, sensor, x, np.array([item.default for item in model.inputs]), p, out)
+    _expect(model, sensor, x, model.default_inputs, p, out)
     return out
 
 
