@@ -10,7 +10,7 @@ import re
 import socket
 import threading
 import zlib
-from collections.abc import Mapping, Sequence
+from collections.abc import Awaitable, Callable, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, field
 from decimal import Decimal, InvalidOperation
@@ -418,27 +418,13 @@ class OpcUaSource:
         self._thread.start()
 
     def _run(self) -> None:
-        asyncio.set_event_loop(self._loop)
-        self._loop.run_until_complete(self._stay())
-        self._loop.close()
-
-    async def _stay(self) -> None:
         """Subscribe, again and again, until the source is closed."""
-        while not self._stopping.is_set():
-            try:
-                await self._subscribed()
-            except Exception as error:  # noqa: BLE001  asyncua raises many kinds; the server is tried again
-                why = printable(str(error) or type(error).__name__)
-                text = f"no measurements from the server at {self._url}: {why}; it is tried again"
-                self._report(NO_BROKER, text)
-            self.connected.clear()
-            await self._pause(RETRY_S)
+        run_again(self._loop, self._subscribed, self._stopping, RETRY_S, self._failed)
+        self.connected.clear()
 
-    async def _pause(self, seconds: float) -> None:
-        try:
-            await asyncio.wait_for(self._stopping.wait(), seconds)
-        except TimeoutError:
-            pass
+    def _failed(self, why: str) -> None:
+        self.connected.clear()
+        self._report(NO_BROKER, f"no measurements from the server at {self._url}: {why}; it is tried again")
 
     async def _subscribed(self) -> None:
         from asyncua import Client
@@ -448,7 +434,7 @@ class OpcUaSource:
             await subscription.subscribe_data_change([client.get_node(node) for node in self._names])
             self.connected.set()
             while not self._stopping.is_set():
-                await self._pause(CHECK_S)
+                await _pause(self._stopping, CHECK_S)
                 await client.check_connection()
 
     def changed(self, name: str, value: Any) -> None:
@@ -479,6 +465,36 @@ class OpcUaSource:
         with suppress(RuntimeError):  # the loop has ended
             self._loop.call_soon_threadsafe(self._stopping.set)
         self._thread.join(STOP_TIMEOUT_S)
+
+
+def run_again(
+    loop: asyncio.AbstractEventLoop,
+    work: Callable[[], Awaitable[None]],
+    stopping: asyncio.Event,
+    retry: float,
+    failed: Callable[[str], None],
+) -> None:
+    """Run work in a loop of this thread, again `retry` seconds after its end, until `stopping` is set.
+
+    `failed` is called with the reason of each failure.
+    """
+
+    async def stay() -> None:
+        while not stopping.is_set():
+            try:
+                await work()
+            except Exception as error:  # noqa: BLE001  asyncua raises many kinds; no client may end the thread
+                failed(printable(str(error) or type(error).__name__))
+            await _pause(stopping, retry)
+
+    asyncio.set_event_loop(loop)
+    loop.run_until_complete(stay())
+    loop.close()
+
+
+async def _pause(stopping: asyncio.Event, seconds: float) -> None:
+    with suppress(TimeoutError):
+        await asyncio.wait_for(stopping.wait(), seconds)
 
 
 class NodeHandler:

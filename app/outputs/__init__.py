@@ -133,10 +133,9 @@ class Publisher:
         secrets = secrets_of(section, twin.loaded.places)
         mqtt = None
         if section.mqtt is not None:
-            from .mqtt import JsonTopics, MqttOutput
+            from .mqtt import MqttOutput
 
-            form = JsonTopics(section.mqtt.prefix, twin.name, lambda: self._engine.model)
-            mqtt = MqttOutput(section.mqtt, twin.name, form, notices, secrets)
+            mqtt = MqttOutput(section.mqtt, twin.name, lambda: self._engine.model, notices, secrets)
         outputs: list[Output] = [] if mqtt is None else [mqtt]
         if section.opcua is not None:
             from .opcua import OpcUaOutput

@@ -56,10 +56,10 @@ class FleetPublisher:
         self._mqtt: MqttOutput | None = None
         self._changed, self._connections = ChangedAssets(), 0
         if section.mqtt is not None:
-            from .mqtt import JsonTopics, MqttOutput
+            from .mqtt import MqttOutput
 
-            form = JsonTopics(section.mqtt.prefix, plan.name, lambda: plan.twin.model, of_assets=True)
-            self._mqtt = MqttOutput(section.mqtt, plan.name, form, self.notices, secrets)
+            notices, model = self.notices, lambda: plan.twin.model
+            self._mqtt = MqttOutput(section.mqtt, plan.name, model, notices, secrets, of_assets=True)
         self._deliveries = Deliveries(section.receivers, folder, self._mqtt, self.notices, secrets)
         self._rules = FleetRules(rules or (HEALTH_RULE,), plan.name, link=page)
         self._store = AlertStore(store, plan.name, self.notices)

@@ -40,71 +40,42 @@ class Packet(NamedTuple):
     retain: bool = False
 
 
-class JsonTopics:
-    """Messages of one twin as JSON, under PREFIX/TWIN; or of the assets of a fleet, under PREFIX/FLEET/ASSET."""
-
-    def __init__(
-        self, prefix: str, name: str, model: Callable[[], StateSpaceModel], *, of_assets: bool = False
-    ) -> None:
-        """Name the topics.
-
-        Args:
-            prefix: First part of the topics.
-            name: Name of the twin or fleet.
-            model: Returns its present model.
-            of_assets: Whether states are those of assets. They are retained, as one is published when it changes.
-        """
-        self._name, self._model, self._of_assets = name, model, of_assets
-        self.place = f"{prefix}/{name}"
-
-    def death(self) -> Packet:
-        """Return the message that ends a connection; as last will, the broker publishes it when it loses one."""
-        return self._status(online=False)
-
-    def births(self) -> list[Packet]:
-        """Return the messages that begin a connection."""
-        return [Packet(f"{self.place}/{BIRTH}", self._birth(), qos=1, retain=True), self._status(online=True)]
-
-    def state(self, message: StateMessage) -> Packet:
-        """Return the message of a state."""
-        place = f"{self.place}/{message.twin.translate(ESCAPES)}" if self._of_assets else self.place
-        return Packet(f"{place}/{STATE}", message.model_dump_json(), retain=self._of_assets)
-
-    def _status(self, *, online: bool) -> Packet:
-        body = json.dumps({"online": online, "since": iso_now()})
-        return Packet(f"{self.place}/{STATUS}", body, qos=1, retain=True)
-
-    def _birth(self) -> str:
-        """Return names and units of all values, and the schema of the messages."""
-        model = self._model()
-        parts: dict[str, Any] = {"states": model.shown_states, "inputs": model.inputs}
-        names = {key: [{"name": item.name, "unit": item.unit} for item in items] for key, items in parts.items()}
-        told = {"twin": self._name, "since": iso_now(), **names, "sensors": list(model.sensor_names)}
-        return json.dumps(told | {"schema": state_schema()})
-
-
 class MqttOutput:
-    """Publishes through a thread of paho-mqtt, which connects again for as long as the twin runs."""
+    """Publishes JSON through a thread of paho-mqtt, which connects again for as long as the twin runs.
+
+    The topics are under PREFIX/TWIN; those of the assets of a fleet under PREFIX/FLEET/ASSET.
+    """
 
     name = "mqtt"
 
-    def __init__(self, section: MqttSection, name: str, form: JsonTopics, notices: Notices, secrets: Secrets) -> None:
+    def __init__(
+        self,
+        section: MqttSection,
+        name: str,
+        model: Callable[[], StateSpaceModel],
+        notices: Notices,
+        secrets: Secrets,
+        *,
+        of_assets: bool = False,
+    ) -> None:
         """Prepare; nothing is connected yet.
 
         Args:
             section: The broker.
             name: Name of the twin or fleet.
-            form: Its messages.
+            model: Returns its present model.
             notices: Where problems are reported.
             secrets: See `secrets_of`.
+            of_assets: Whether states are those of assets. They are retained, as one is published when it changes.
 
         Raises:
             ConfigError: If paho-mqtt is missing.
         """
         from sources.brokers import mqtt_client
 
-        self._section, self._form, self._notices = section, form, notices
-        self._alerts = f"{section.prefix}/{name}/{ALERT}"
+        self._section, self._notices = section, notices
+        self._name, self._model, self._of_assets = name, model, of_assets
+        self._root = f"{section.prefix}/{name}"
         password = None if section.password_env is None else secrets[section.password_env]
         self.client: Any = mqtt_client(section, password, client_id=f"nisus-{name}")
         self.client.on_pre_connect = self._connecting
@@ -137,7 +108,7 @@ class MqttOutput:
             self._dropped += full
             first = full and self._dropped == 1
         if not full:
-            self._hand_over([self._form.state(message)])
+            self._hand_over([self._state(message)])
         elif first:
             text = f"output mqtt: the broker at {self._place} takes states too slowly; some are dropped"
             self._notices.count("output mqtt")
@@ -153,7 +124,7 @@ class MqttOutput:
             raise OSError(self._problem)
         with self._counting:
             self._unsent += 1
-        sent = self.client.publish(self._alerts, alert.model_dump_json(), qos=1)
+        sent = self.client.publish(f"{self._root}/{ALERT}", alert.model_dump_json(), qos=1)
         try:
             sent.wait_for_publish(TIMEOUT_S)
         except RuntimeError as error:
@@ -164,7 +135,7 @@ class MqttOutput:
     def stop(self) -> None:
         """Publish the death, and disconnect."""
         if self.client.is_connected():
-            sent = self.client.publish(*self._form.death())
+            sent = self.client.publish(*self._status(online=False))
             try:
                 sent.wait_for_publish(1.0)
             except (RuntimeError, ValueError):
@@ -180,7 +151,7 @@ class MqttOutput:
 
     @property
     def _place(self) -> str:
-        return f"{self._section.host}:{self._section.port}, {self._form.place}"
+        return f"{self._section.host}:{self._section.port}, {self._root}"
 
     def _hand_over(self, packets: list[Packet]) -> None:
         with self._counting:
@@ -188,10 +159,31 @@ class MqttOutput:
         for packet in packets:
             self.client.publish(*packet)
 
+    # Messages
+
+    def _state(self, message: StateMessage) -> Packet:
+        """Return the message of a state."""
+        place = f"{self._root}/{message.twin.translate(ESCAPES)}" if self._of_assets else self._root
+        return Packet(f"{place}/{STATE}", message.model_dump_json(), retain=self._of_assets)
+
+    def _status(self, *, online: bool) -> Packet:
+        """Return whether the twin is online; as last will, the broker publishes the end when it loses a connection."""
+        body = json.dumps({"online": online, "since": iso_now()})
+        return Packet(f"{self._root}/{STATUS}", body, qos=1, retain=True)
+
+    def _birth(self) -> Packet:
+        """Return the first message of a connection: names and units of all values, and the schema of the messages."""
+        model = self._model()
+        parts: dict[str, Any] = {"states": model.shown_states, "inputs": model.inputs}
+        names = {key: [{"name": item.name, "unit": item.unit} for item in items] for key, items in parts.items()}
+        told = {"twin": self._name, "since": iso_now(), **names, "sensors": list(model.sensor_names)}
+        body = json.dumps(told | {"schema": state_schema()})
+        return Packet(f"{self._root}/{BIRTH}", body, qos=1, retain=True)
+
     # On the thread of the client
 
     def _connecting(self, client: Any, _data: Any) -> None:
-        client.will_set(*self._form.death())
+        client.will_set(*self._status(online=False))
 
     def _connected(self, client: Any, _data: Any, _flags: Any, reason: Any, _properties: Any) -> None:
         if reason.is_failure:
@@ -200,7 +192,7 @@ class MqttOutput:
         with self._counting:
             self._unsent, self._dropped = 0, 0
         self.connections += 1
-        self._hand_over(self._form.births())
+        self._hand_over([self._birth(), self._status(online=True)])
         if self._reported:
             self._reported = False
             self._notices.say(f"output mqtt: connected again to {self._place}")

@@ -10,7 +10,8 @@ from contextlib import suppress
 from datetime import UTC, datetime, timedelta
 from typing import TYPE_CHECKING, Any
 
-from estimators.errors import ConfigError, printable
+from estimators.errors import ConfigError
+from sources.brokers import run_again
 
 from ..live.outputs import OutputLink
 from ..present.state_message import PublishedState, StateMessage
@@ -95,27 +96,17 @@ class OpcUaOutput:
     # On the thread of the server
 
     def _run(self) -> None:
-        asyncio.set_event_loop(self._loop)
-        self._loop.run_until_complete(self._stay())
-        self._loop.close()
-
-    async def _stay(self) -> None:
         """Serve until the twin stops; if the port is in use, try again."""
-        while not self._stopping.is_set():
-            try:
-                await self._serve()
-            except Exception as error:  # noqa: BLE001  no client and no fault of the library may end the output
-                problem = printable(str(error) or type(error).__name__)
-                if problem != self._problem:
-                    text = f"output opcua: {self.url} is not served ({problem}); it is tried again"
-                    self._engine.notices.say(text, level="warn")
-                    self._engine.notices.count("output opcua")
-                self._problem = problem
-            self._serving = False
-            try:
-                await asyncio.wait_for(self._stopping.wait(), RETRY_S)
-            except TimeoutError:
-                pass
+        run_again(self._loop, self._serve, self._stopping, RETRY_S, self._failed)
+        self._serving = False
+
+    def _failed(self, problem: str) -> None:
+        self._serving = False
+        if problem != self._problem:
+            text = f"output opcua: {self.url} is not served ({problem}); it is tried again"
+            self._engine.notices.say(text, level="warn")
+            self._engine.notices.count("output opcua")
+        self._problem = problem
 
     async def _serve(self) -> None:
         from asyncua import Server, ua
