@@ -29,6 +29,7 @@ from ..twin.log_reader import remarking
 from ..views.recording.rrd_file import parse_split
 from ..web.fleet import FleetApi
 from ..web.service import Service
+from ..web.supervisor import Supervisor
 from .options import settings
 from .prepare import attend, compile_for
 from .serve import PRELOADED, door_of, run_child, serve_until_end
@@ -128,7 +129,8 @@ def _serve(
     archived = None if archive is None else archive.folder
     opened = partial(_opened, arguments.fleet, overrides, arguments.recordings, archived)
     overview = FleetApi(running)
-    service = Service({}, partial(run_child, opened, False), door=door, preload=FLEET_PRELOADED, overview=overview)
+    supervisor = Supervisor({}, partial(run_child, opened, False), preload=FLEET_PRELOADED, on_demand=True)
+    service = Service(supervisor, door=door, overview=overview)
     running.start()
     try:
         serve_until_end(service, f"the fleet {running.plan.name}", arguments.duration)

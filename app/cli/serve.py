@@ -25,7 +25,7 @@ from ..views.recording.rrd_file import NEVER, Split, parse_split
 from ..web.door import LOOPBACK, Door, check_port
 from ..web.gate import NEEDS_TOKENS, Grant, grants_of
 from ..web.service import BLANK, Service, TwinFolder
-from ..web.supervisor import STATUS_PERIOD_S, forget_safe_path
+from ..web.supervisor import STATUS_PERIOD_S, Supervisor, forget_safe_path
 
 if TYPE_CHECKING:
     from ..web.session import Session
@@ -67,12 +67,12 @@ def serve(arguments: ServeCommand) -> int:
             raise ConfigError(f"{place}: must be a folder, in which each twin has its own file")
     door = door_of(arguments, grants)
     options = options._replace(site=door.site)
-    service = Service(
-        twins, partial(run_child, partial(_opened, options), options.json), door=door, preload=PRELOADED,
+    supervisor = Supervisor(
+        twins, partial(run_child, partial(_opened, options), options.json), preload=PRELOADED,
         at_once=max(1, (os.cpu_count() or 2) // 2),
         folder=folder,
     )  # fmt: skip
-    return serve_until_end(service, f"{len(twins)} twin(s)", arguments.duration)
+    return serve_until_end(Service(supervisor, door=door), f"{len(twins)} twin(s)", arguments.duration)
 
 
 def _grants(arguments: ServiceOptions) -> tuple[Grant, ...]:

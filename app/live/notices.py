@@ -152,21 +152,23 @@ class Audit:
         self._entries: deque[AuditEntry] = deque(maxlen=MAX_COMMANDS)
         self._next = self._changes = 0
 
-    def add(
-        self, user: str, role: str, address: str, path: str, body: Mapping[str, Any], revision: int | None = None
-    ) -> None:
-        """Note a request that was carried out; `revision` was shown when it arrived, by default that of now."""
+    def add(self, user: Iterable[str], path: str, body: Mapping[str, Any], revision: int | None = None) -> None:
+        """Note a request of a user (name, role and address) that was carried out.
+
+        `revision` was shown when it arrived, by default that of now.
+        """
         with self._lock:
+            name, role, address = user
             last, gesture = self._entries[-1] if self._entries else None, body.get("gesture")
             number = self._next
             if last is not None and gesture and (last.user, last.address, last.body.get("gesture")) == (
-                user, address, gesture,
+                name, address, gesture,
             ):  # fmt: skip
                 number = self._entries.pop().number
             self._next, self._changes = number + 1, self._changes + 1
             revision = self.revision() if revision is None else revision
             self._entries.append(
-                AuditEntry(number, time.time(), user, role, address, path, body, revision, self._changes)
+                AuditEntry(number, time.time(), name, role, address, path, body, revision, self._changes)
             )
 
     def entries(self, after: int = -1) -> list[AuditEntry]:

@@ -146,9 +146,7 @@ class Auditor(Protocol):
     def revision(self) -> int | None:
         """Return the revision that is shown; None if there are several twins."""
 
-    def add(
-        self, user: str, role: str, address: str, path: str, body: Mapping[str, Any], revision: int | None = None
-    ) -> None:
+    def add(self, user: User, path: str, body: Mapping[str, Any], revision: int | None = None) -> None:
         """Note a request that was carried out; `revision` was shown when it arrived, by default that of now."""
 
 
@@ -362,8 +360,7 @@ async def _audited(audit: Auditor, application: ASGIApp, scope: Scope, receive: 
             fields = found if isinstance(found, dict) else dict(QueryParams(scope["query_string"]))
             if len(body) > MAX_NOTED_BYTES:
                 fields = {"command": fields.get("command"), "bytes": len(body)}
-            user = scope.get(USER) or User(SESSION, "", "")
-            audit.add(user.name, user.role, user.address, scope["path"], fields, revision)
+            audit.add(scope.get(USER) or User(SESSION, "", ""), scope["path"], fields, revision)
         await send(message)
 
     await application(scope, receive_and_keep, send_and_note)

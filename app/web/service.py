@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import asyncio
 import time
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any, Protocol
 from urllib.parse import quote
@@ -25,10 +25,10 @@ from estimators.errors import ConfigError, is_blank, nearest, quoted
 from ..terminal import print_line
 from .door import Door
 from .forward import Forwarded, credentials
-from .gate import USER
+from .gate import USER, User
 from .http import PAGE, get, page_file, post, refusal
 from .request_threads import in_thread
-from .supervisor import FAILED, FIRST_RETRY_S, RUNNING, STARTING, STOPPED, Child, ServedTwin, Supervisor
+from .supervisor import FAILED, FIRST_RETRY_S, RUNNING, STARTING, STOPPED, ServedTwin, Supervisor
 from .viser_proxy import couple
 
 BLANK = "a twin has the name of its file, which is blank; rename it"
@@ -60,34 +60,16 @@ class Overview(Protocol):
 class Service:
     """Starts the processes of twins, watches them, and serves their overview and pages."""
 
-    def __init__(
-        self,
-        twins: Mapping[str, str],
-        child: Child,
-        *,
-        door: Door,
-        folder: Callable[[], Mapping[str, str]] | None = None,
-        preload: Sequence[str] = (),
-        at_once: int = 2,
-        overview: Overview | None = None,
-    ) -> None:
+    def __init__(self, supervisor: Supervisor, *, door: Door, overview: Overview | None = None) -> None:
         """Add the routes to the door; nothing runs yet.
 
         Args:
-            twins: Paths of the twins by name.
-            child: Runs one of them.
+            supervisor: Starts the twins; with an overview on demand.
             door: Serves the overview.
-            folder: Returns the twins of a folder, which are added and removed as its files are.
-            preload: Modules that the processes share.
-            at_once: Twins that start at the same time.
             overview: In place of the gallery, and of the twins.
         """
-        self.door, self._overview = door, overview
-        on_demand = overview is not None
-        self._supervisor = Supervisor(
-            twins, child, folder=folder, preload=preload, at_once=at_once, on_demand=on_demand
-        )
-        self.twins = self._supervisor.twins
+        self.door, self._overview, self._supervisor = door, overview, supervisor
+        self.twins = supervisor.twins
         routes = [
             get("/gallery", self._page),
             get("/readyz", self._ready),
@@ -117,13 +99,11 @@ class Service:
     def revision(self) -> None:
         """A service has twins, of which each has its revisions."""
 
-    def add(
-        self, user: str, role: str, address: str, path: str, body: Mapping[str, Any], revision: int | None = None
-    ) -> None:
+    def add(self, user: User, path: str, body: Mapping[str, Any], revision: int | None = None) -> None:
         """Pass a request that starts or stops a twin on to the audit log of that."""
         twin = self.twins.get(str(body.get("twin", "")))
         if twin is not None and path.startswith("/api/gallery/"):
-            self._supervisor.note(twin, (user, role, address, path, {}))
+            self._supervisor.note(twin, (tuple(user), path, {}))
 
     def find(self, name: str) -> ServedTwin:
         """Return a twin.

@@ -327,19 +327,19 @@ def test_commands_of_users_are_kept(tmp_path, monkeypatch):
     monkeypatch.setattr("app.live.store.MAX_COMMANDS", 3)
     path = tmp_path / "a.store"
     before = Session(path).put(walk(50))
-    audit = before.engine.audit
+    audit, ann = before.engine.audit, ("ann", "tune", "10.0.0.3")
     for value in range(5):
-        audit.add("ann", "tune", "10.0.0.3", "/api/command", {"command": "SetTuning", "value": value, "gesture": "g"})
+        audit.add(ann, "/api/command", {"command": "SetTuning", "value": value, "gesture": "g"})
     before.write()
-    audit.add("ann", "tune", "10.0.0.3", "/api/command", {"command": "SetTuning", "value": 9, "gesture": "g"})
+    audit.add(ann, "/api/command", {"command": "SetTuning", "value": 9, "gesture": "g"})
     for name in ("Reset", "Undo", "Redo"):
-        audit.add("bob", "admin", "10.0.0.4", "/api/command", {"command": name})
+        audit.add(("bob", "admin", "10.0.0.4"), "/api/command", {"command": name})
     entries = audit.entries()
     assert [entry.body.get("value", entry.body["command"]) for entry in entries] == [9, "Reset", "Undo", "Redo"]
     before.write().kill()
     after = Session(path)
     assert [replace(entry, change=0) for entry in entries[1:]] == after.engine.audit.entries()
-    after.engine.audit.add("ann", "tune", "10.0.0.3", "/api/command", {"command": "Restore"})
+    after.engine.audit.add(ann, "/api/command", {"command": "Restore"})
     assert [entry.number for entry in after.engine.audit.entries()] == [1, 2, 3, 4]
     after.running.stop()
 
