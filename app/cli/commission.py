@@ -5,7 +5,6 @@ from __future__ import annotations
 from typing import TYPE_CHECKING
 
 from estimators.diagnostics.episodes import episodes
-from estimators.fold import Fold
 from estimators.track import HEALTH_NAMES, STALE
 
 from ..format_time import duration_text
@@ -30,7 +29,7 @@ def commission_twin(arguments: Arguments) -> int:
     twin = load_twin(arguments.twin, log_files=arguments.log or None, overrides=overrides)
     prepare(twin)
     log, _ = read_log(twin, arguments.duration)
-    fold = Fold(twin.estimator, twin.model, twin.tuning, log, policy=twin.policy)
+    fold = twin.fold(log, policy=twin.policy)
     interruptible(fold, fold.advance)
     gaps = [item.size for item in episodes(fold) if item.cause == HEALTH_NAMES[STALE]]
     if gaps:

@@ -13,7 +13,6 @@ from estimators.errors import ConfigError
 from estimators.fit.entries import Setting
 from estimators.fit.judge import PartScore, worths
 from estimators.fit.recording import Recording, held_out_rows
-from estimators.fold import Fold
 from estimators.learned.train import NET, Trained, against, known, on_held_out, on_windows, train
 from estimators.learned.windows import Windows, known_states, windows
 from estimators.model.hybrid import check_places
@@ -62,7 +61,7 @@ def learn_correction(arguments: Arguments) -> int:
     def cut() -> Windows:
         parts = []
         for log in logs:
-            fold = Fold(twin.estimator, twin.model, twin.tuning, log)
+            fold = twin.fold(log)
             fold.advance()
             held_out = held_out_rows(log, arguments.blocks)
             parts.append(

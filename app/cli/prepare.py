@@ -5,6 +5,7 @@ from __future__ import annotations
 import threading
 import time
 from collections.abc import Callable, Iterator, Sequence
+from concurrent.futures import Future, wait
 from contextlib import contextmanager
 from typing import TYPE_CHECKING, Any
 
@@ -17,6 +18,7 @@ from estimators.registry import ESTIMATORS, unfit
 from sources.pieces import make, pieces_of
 
 from ..live.compilers import Compiler
+from ..live.jobs import start_in_thread
 from ..live.watchdog import CallWatch, interruptible
 from ..live.workshop import Workshop
 from ..terminal import complain, messages_file
@@ -59,10 +61,7 @@ def fold_log(twin: Twin, log: Log, *, picture: Any = None, pairs: np.ndarray | N
         picture: Function that takes pictures of the estimate for a recording.
         pairs: Pairs of states whose covariance the track keeps, those of the twin's view first; None for these.
     """
-    fold = Fold(
-        twin.estimator,
-        twin.model,
-        twin.tuning,
+    fold = twin.fold(
         log,
         pairs=twin.pairs if pairs is None else pairs,
         policy=twin.policy,
@@ -96,7 +95,7 @@ def compile_for(twin: Twin) -> None:
     """
 
     def work() -> None:
-        Fold(twin.estimator, twin.model, twin.tuning, Log.of(twin.model), pairs=twin.pairs)
+        twin.fold(pairs=twin.pairs)
         for name in twin.kernels:
             for piece in pieces_of(name):
                 make(piece)
@@ -125,7 +124,7 @@ def prepare_model(twin: Twin, workshop: Workshop) -> None:
     """
 
     def work() -> None:
-        Fold(twin.estimator, twin.model, twin.tuning, Log.of(twin.model), pairs=twin.pairs, idle=True)
+        twin.fold(pairs=twin.pairs, idle=True)
         for name in twin.kernels:
             workshop.wait(name)
 
@@ -157,28 +156,15 @@ def attend(
     Raises:
         BaseException: As the work.
     """
-    result: list[Any] = []
-    failure: list[BaseException] = []
-    # Python 3.11 takes a thread whose `join` was interrupted for ended.
-    over = threading.Event()
-
-    def run() -> None:
-        try:
-            result.append(work())
-        except BaseException as error:  # noqa: BLE001  raised again below, in the caller's thread
-            failure.append(error)
-        finally:
-            over.set()
-
     begun = time.monotonic()
 
     def status() -> str:
         return f"{doing}: {time.monotonic() - begun:.0f} s{text() and ', '}{text()}"
 
-    threading.Thread(target=run, name="compile", daemon=True).start()
-    while not over.is_set():
+    over = start_in_thread(work, "compile")
+    while not over.done():
         try:
-            if not over.wait(STATUS_DELAY_S):
+            if wait([over], STATUS_DELAY_S).not_done:
                 _watch(over, None if model is None else CallWatch(model), status, f"{doing} ...")
                 if done is not None:
                     _console().print(f"{done}: {time.monotonic() - begun:.0f} s", highlight=False)
@@ -188,16 +174,14 @@ def attend(
             stop()
             stop = None
             complain("interrupted; the best result so far follows. Press Ctrl-C again to end at once.")
-    if failure:
-        raise failure[0]
-    return result[0]
+    return over.result()
 
 
-def _watch(over: threading.Event, watch: CallWatch | None, text: Callable[[], str], first: str) -> None:
+def _watch(over: Future[Any], watch: CallWatch | None, text: Callable[[], str], first: str) -> None:
     """Show what a thread does until it is over, and name a function of the model that does not return."""
     console = _console()
     with _shown(text, console, first):
-        while not over.wait(0.5):
+        while wait([over], 0.5).not_done:
             line = None if watch is None else watch.look()
             if line is not None:
                 console.print(line, highlight=False, soft_wrap=True)

@@ -65,9 +65,7 @@ def _save(arguments: Arguments, name: str) -> None:
     scores = figures(score(fold.track, log.events, twin.model, pictures_of(fold), gate=twin.tuning.gate))
     given = Settings(twin.estimator, twin.tuning, printable(arguments.note), scores=scores)
     path = keep(twin, name, version_text(twin, given))
-    print(
-        to_json({"name": name, "kept": str(path), "scores": scores}) if arguments.json else f"{shown_path(path)}: kept"
-    )
+    _print(arguments, f"{shown_path(path)}: kept", name=name, kept=str(path), scores=scores)
 
 
 def _accept(arguments: Arguments, name: str) -> None:
@@ -76,7 +74,7 @@ def _accept(arguments: Arguments, name: str) -> None:
         raise ConfigError(f"--accept {OWN_VALUES}: the twin's own file applies until a version is accepted")
     accept(twin.version, printable(arguments.note))
     path = twin.version.path
-    print(to_json({"name": name, "accepted": str(path)}) if arguments.json else f"{shown_path(path)}: accepted")
+    _print(arguments, f"{shown_path(path)}: accepted", name=name, accepted=str(path))
 
 
 def _apply(arguments: Arguments, name: str) -> None:
@@ -86,7 +84,11 @@ def _apply(arguments: Arguments, name: str) -> None:
     model = twin.model
     prior = (model.prior_mean, np.diag(model.prior_std**2)) if twin.version.section.prior else None
     text = apply_tuning(load_twin(arguments.twin), twin.estimator, twin.tuning, prior)
-    print(to_json({"name": name, "applied": str(twin.path)}) if arguments.json else text)
+    _print(arguments, text, name=name, applied=str(twin.path))
+
+
+def _print(arguments: Arguments, text: str, **result: Any) -> None:
+    print(to_json(result) if arguments.json else text)
 
 
 def _list(arguments: Arguments) -> None:

@@ -8,7 +8,6 @@ import numpy as np
 
 from estimators.attribution import Attribution, attribution
 from estimators.errors import ConfigError, nearest
-from estimators.fold import Fold
 
 from ..present.result import to_json, to_text
 from ..studies.analysis.why import why_json, why_topics
@@ -35,7 +34,7 @@ def explain_change(arguments: Arguments) -> int:
     span = twin.config.view.window if arguments.span is None else arguments.span
     if not span > 0.0:
         raise ConfigError(f"--span {span:g}: must be positive")
-    fold = Fold(twin.estimator, twin.model, twin.tuning, log, policy=twin.policy, expected=twin.expected)
+    fold = twin.fold(log, policy=twin.policy, expected=twin.expected)
     found: Attribution = attend(twin.model, lambda: attribution(fold, until - round(span * 1e9), until), "folding")
     origin = int(events.t[0])
     if arguments.json:

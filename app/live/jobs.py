@@ -13,7 +13,7 @@ import sys
 import threading
 import time
 from collections.abc import Callable, Iterator
-from concurrent.futures import Executor
+from concurrent.futures import Executor, Future, wait
 from typing import Any
 
 from estimators.errors import NisusError
@@ -285,22 +285,27 @@ def run_all(*works: Callable[[], Any]) -> None:
     """Run callables concurrently, the first in this thread, and wait for all.
 
     Raises:
-        BaseException: The error of the first one that failed, once all are done.
+        BaseException: The error of the first one that failed, in their order, once all are done.
     """
-    failures: list[BaseException] = []
-
-    def carry_out(work: Callable[[], Any]) -> None:
-        try:
+    begun = [start_in_thread(work, "one of several") for work in works[1:]]
+    try:
+        for work in works[:1]:
             work()
-        except BaseException as error:  # noqa: BLE001  raised again below, in the caller's thread
-            failures.append(error)
+    finally:
+        wait(begun)
+    for outcome in begun:
+        outcome.result()
 
-    threads = [threading.Thread(target=carry_out, args=(work,), daemon=True) for work in works[1:]]
-    for thread in threads:
-        thread.start()
-    for work in works[:1]:
-        carry_out(work)
-    for thread in threads:
-        thread.join()
-    if failures:
-        raise failures[0]
+
+def start_in_thread(work: Callable[[], Any], name: str) -> Future[Any]:
+    """Call a function in a daemon thread of its own; the future has its result or error."""
+    outcome: Future[Any] = Future()
+
+    def run() -> None:
+        try:
+            outcome.set_result(work())
+        except BaseException as error:  # noqa: BLE001  raised again by the future
+            outcome.set_exception(error)
+
+    threading.Thread(target=run, name=name, daemon=True).start()
+    return outcome

@@ -10,6 +10,7 @@ import sys
 import threading
 import time
 from collections.abc import Callable, Iterable, Iterator
+from concurrent.futures import wait
 from contextlib import contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -20,6 +21,7 @@ from estimators.model.state_space import StateSpaceModel
 from estimators.numerics.jit import plain
 
 from ..terminal import complain
+from .jobs import start_in_thread
 
 if TYPE_CHECKING:
     from estimators.fold import Fold
@@ -173,23 +175,17 @@ def interruptible(fold: Fold, work: Callable[[], Any]) -> None:
 
     A function of the fold's model that does not return is named on standard error. Raises as the work.
     """
-    failure: list[BaseException] = []
     watchdog = Watchdog(lambda text, level: complain(text))
 
     def run() -> None:
-        try:
-            with watchdog.watched(fold):
-                work()
-        except BaseException as error:  # noqa: BLE001  raised again below, in the caller's thread
-            failure.append(error)
+        with watchdog.watched(fold):
+            work()
 
-    thread = threading.Thread(target=run, name="fold", daemon=True)
-    thread.start()
-    while thread.is_alive():
-        thread.join(0.5)
+    over = start_in_thread(run, "fold")
+    while not over.done():
+        wait([over], 0.5)
         watchdog.look()
-    if failure:
-        raise failure[0]
+    over.result()
 
 
 def _in_python(fold: Fold) -> str | None:

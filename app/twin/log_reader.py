@@ -10,7 +10,6 @@ import numpy as np
 
 from config.source_schema import SimulatorSection
 from estimators.errors import ConfigError, SourceError
-from estimators.fold import Fold
 from estimators.late import inflated
 from estimators.log import TRUTH, Log
 from sources.brokers import NO_BROKER, REFUSED_MESSAGE, REFUSED_TOPIC
@@ -88,7 +87,7 @@ def read_log(twin: Twin, duration: float | None, *, blind: bool = False) -> tupl
     log = Log.of(twin.model)
     horizon = round(twin.config.time.horizon * 1e9)
     # What a late reading is inflated by is asked of the estimate when it comes.
-    beside = Fold(twin.estimator, twin.model, twin.tuning, log) if twin.late.inflate else None
+    beside = twin.fold(log) if twin.late.inflate else None
     gap = round(twin.degraded.seconds * 1e9)
     intake = Ingest(twin.model, horizon, remark, twin.maintenance, twin.unknown_inputs, gap=gap)
     try:

@@ -8,7 +8,7 @@ from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from functools import cached_property
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
@@ -21,7 +21,9 @@ from config.yaml_files import parse
 from estimators.diagnostics.episodes.baseline import baseline_of, lost_from
 from estimators.diagnostics.health import HealthPolicy
 from estimators.errors import LARGEST, ConfigError, EstimatorError
+from estimators.fold import Fold
 from estimators.fold_checks import check_variances
+from estimators.log import Log
 from estimators.model.state_space import StateSpaceModel
 from estimators.registry import checked, find_entry, find_estimator
 from estimators.tuning import CHANGED_MARK, Tuning
@@ -162,6 +164,10 @@ class Twin:
     def kernels(self) -> tuple[str, ...]:
         """What its source compiles (`sources/pieces.py`); a recording that is reviewed is no source."""
         return () if self.recorded else self.plan.kernels
+
+    def fold(self, log: Log | None = None, **options: Any) -> Fold:
+        """Return a fold of a log, by default of an empty one, that has not begun; for the options see `Fold`."""
+        return Fold(self.estimator, self.model, self.tuning, Log.of(self.model) if log is None else log, **options)
 
     def check_files(self) -> None:
         """Open the files of its source, and close them, before anything is compiled for it.

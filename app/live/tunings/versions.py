@@ -16,8 +16,6 @@ from config.tunings import OWN_VALUES, Version, check_name, folders, load_versio
 from config.yaml_files import as_section, rewrite, shown_path, with_section, writing
 from estimators.diagnostics.score import Score
 from estimators.errors import LARGEST, ConfigError
-from estimators.fold import Fold
-from estimators.log import Log
 from estimators.registry import find_estimator
 from estimators.tuning import Tuning
 
@@ -106,10 +104,19 @@ def figures(found: Score) -> dict[str, float]:
         NIS: found.nis / found.nis_dof,
         LIKELIHOOD: found.log_likelihood / judged if judged else np.nan,
         REFUSED: found.refused,
-        **{f"{RMSE}.{name}": fit.rmse for name, fit in fits.items()},
-        **{f"{COVERAGE}.{name}": fit.coverage for name, fit in fits.items()},
+        **_fits(fits, "rmse"),
     }
+    return _finite(known)
+
+
+def _finite(known: Mapping[str, float]) -> dict[str, float]:
     return {name: float(value) for name, value in known.items() if np.isfinite(value)}
+
+
+def _fits(items: Mapping[str, Any], rms: str) -> dict[str, float]:
+    """Return RMSE (the field `rms`) and coverage of each item."""
+    errors = {f"{RMSE}.{name}": getattr(item, rms) for name, item in items.items()}
+    return errors | {f"{COVERAGE}.{name}": item.coverage for name, item in items.items()}
 
 
 def version_text(twin: Twin, given: Settings) -> str:
@@ -226,7 +233,7 @@ def load_into(engine: Running, name: str, why: str | None = None) -> None:
     if reason is not None:
         raise ConfigError(f"{name}: {reason}; start the twin with --tuning {name}")
     # Compiled before the engine's thread asks for it.
-    Fold(twin.estimator, twin.model, twin.tuning, Log.of(twin.model), pairs=twin.pairs, idle=True)
+    twin.fold(pairs=twin.pairs, idle=True)
     engine.reload(twin, f"version {name}" if why is None else why, exact=True)
 
 
@@ -259,13 +266,7 @@ def settings_of(twin: Twin, found: Fitted, fitted_on: Sequence[str], note: str =
 
 def _scores(part: PartScore) -> dict[str, float]:
     predicted = {**part.sensors, **part.withheld, **part.states}
-    scores = {
-        NIS: part.nis,
-        LIKELIHOOD: part.log_density,
-        **{f"{RMSE}.{name}": item.rms for name, item in predicted.items()},
-        **{f"{COVERAGE}.{name}": item.coverage for name, item in predicted.items()},
-    }
-    return {name: float(value) for name, value in scores.items() if np.isfinite(value)}
+    return _finite({NIS: part.nis, LIKELIHOOD: part.log_density, **_fits(predicted, "rms")})
 
 
 def _evidence(found: Fitted) -> EvidenceSection:
