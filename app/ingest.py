@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections import deque
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -127,9 +127,8 @@ class Ingest:
     def _reported(self, passed: Passed) -> Passed:
         for refused in passed.refused:
             self._report(WRONG_TIME, refusal(self._named(refused.kind, refused.channel), refused))
-        for by in dict.fromkeys(moved.by for moved in passed.moved):
-            moved = [item for item in passed.moved if item.by == by]
-            self._report(CLOCK_MOVED, clock_moved([self._named(item.kind, item.channel) for item in moved], moved))
+        for line in clock_lines(passed.moved, lambda item: self._named(item.kind, item.channel)):
+            self._report(CLOCK_MOVED, line)
         while self._planned and len(passed.events) and self._planned[0].at <= passed.events.t.max():
             item = self._planned.pop(0)
             self._report(MAINTENANCE, maintenance_text(item.what, item.states, self._model))
@@ -208,12 +207,14 @@ def refusal(name: str, refused: Refused) -> str:
     )
 
 
-def clock_moved(names: Sequence[str], moved: Sequence[Moved]) -> str:
-    """Return the line for channels whose clock made one step; all of one source share its clock."""
-    by, begun = moved[0].by * 1e-9, min(item.t for item in moved) * 1e-9
-    named = ", ".join(names[:6]) + (f" and {len(names) - 6} more" if len(names) > 6 else "")
-    whose, where = "its" if len(names) == 1 else "their", "ahead" if by > 0 else "back"
-    return (
-        f"{named}: {whose} clock was set {abs(by):.6g} s {where} at {begun:.9g} s; times from there on are corrected "
-        "by it (if the rows are out of order, sort them by time)"
-    )
+def clock_lines(every: Sequence[Moved], name: Callable[[Moved], str]) -> Iterator[str]:
+    """Yield a line for the channels whose clocks made the same step, as all of one source share its clock."""
+    for step in dict.fromkeys(item.by for item in every):
+        moved = [item for item in every if item.by == step]
+        by, begun, names = step * 1e-9, min(item.t for item in moved) * 1e-9, [*map(name, moved)]
+        named = ", ".join(names[:6]) + (f" and {len(names) - 6} more" if len(names) > 6 else "")
+        whose, where = "its" if len(names) == 1 else "their", "ahead" if by > 0 else "back"
+        yield (
+            f"{named}: {whose} clock was set {abs(by):.6g} s {where} at {begun:.9g} s; times from there on are "
+            "corrected by it (if the rows are out of order, sort them by time)"
+        )

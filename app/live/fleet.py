@@ -24,7 +24,7 @@ from estimators.track import STALE
 from sources.messages import FORGOTTEN, Messages
 from sources.source import NO_ASSET, WRONG_TIME, Acknowledging, AssetEvents, Marked, Report, is_utc
 
-from ..ingest import CLOCK_MOVED, clock_moved, refusal
+from ..ingest import CLOCK_MOVED, clock_lines, refusal
 from ..twin.fleet import FleetPlan
 from ..twin.twin import Twin
 from .fold_json import tuning_to_json
@@ -288,9 +288,8 @@ class RunningFleet:
         """Take what the guard lets pass, and report what it does not."""
         for refused in passed.refused:
             self.note(WRONG_TIME, refusal(f"asset {quoted(self.names[refused.channel])}", refused))
-        for by in dict.fromkeys(moved.by for moved in passed.moved):
-            moved = [item for item in passed.moved if item.by == by]
-            self.note(CLOCK_MOVED, clock_moved([f"asset {quoted(self.names[item.channel])}" for item in moved], moved))
+        for line in clock_lines(passed.moved, lambda item: f"asset {quoted(self.names[item.channel])}"):
+            self.note(CLOCK_MOVED, line)
         t, arrival, _, at, own = passed.events
         if at.size:
             kind, channel = own[:, -2].astype(np.int8), own[:, -1].astype(np.int32)

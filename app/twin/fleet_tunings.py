@@ -12,7 +12,7 @@ import numpy as np
 from config.fleet_schema import AssetTuningsSection
 from config.yaml_files import ValuePlaces, shown_path
 from estimators.errors import ConfigError, SourceError, is_blank, nearest, quoted
-from estimators.fleet.tunings import GROUPS
+from estimators.fleet.tunings import GROUPS, out_of_range
 from estimators.tuning import Tuning
 from sources.tables.text import csv_format, open_text
 from sources.units import conversion, heading_unit
@@ -84,7 +84,8 @@ def asset_values(
     for key in dict.fromkeys(key for own in cells.values() for key in own):
         found = [cells.get(name, {}).get(key, (np.nan, "")) for name in names]
         columns[key] = np.array([value for value, _ in found])
-        _check_range(key, columns[key], [place for _, place in found], names, tuning)
+        if wrong := out_of_range(tuning, key, columns[key]):
+            raise ConfigError(f"{found[wrong[0]][1]}: asset {names[wrong[0]]}: {wrong[1]}")
     return AssetValues(names, columns)
 
 
@@ -97,17 +98,6 @@ def _check_key(key: str, tuning: Tuning, place: str) -> None:
             raise ConfigError(f"{place}: {error}") from None
     known = [name for name in tuning.keys() if name.partition(".")[0] in GROUPS]
     raise ConfigError(f"{place}: {quoted(key)} is no value of Q, R or p, which may differ; {nearest(key, known)}")
-
-
-def _check_range(key: str, column: np.ndarray, places: Sequence[str], names: Sequence[str], tuning: Tuning) -> None:
-    if np.isnan(column).all():
-        return
-    # The extremes: where these are in range, so are the others.
-    for k in (int(np.nanargmin(column)), int(np.nanargmax(column))):
-        try:
-            tuning.set(key, float(column[k]))
-        except ConfigError as error:
-            raise ConfigError(f"{places[k]}: asset {names[k]}: {error}") from None
 
 
 def _read(file: Path, asset_column: str, tuning: Tuning) -> Cells:

@@ -6,11 +6,15 @@ searched) and an effect size. δ is the step of the grid on which the values lie
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from typing import NamedTuple
 
 import numpy as np
 from scipy.special import bdtr, bdtrc
 from scipy.stats import rankdata
+
+from ..log import READING, Events
+from ..model.state_space import StateSpaceModel
 
 HELD, STEPS, DEAD_BAND, LINEAR = "held", "held or set point", "dead band", "interpolated or computed"
 SINGLE, UNDECIDED = "", "undecided"
@@ -64,6 +68,14 @@ class Finding(NamedTuple):
         if self.kind == HELD:
             return f"every {self.longest:.4g} s"
         return "changes" if self.kind in (STEPS, DEAD_BAND) else ""
+
+
+def sensor_rows(model: StateSpaceModel, events: Events) -> Iterator[tuple[str, str, int, np.ndarray]]:
+    """Yield sensor, row, its column and the mask (N,) of its measurements, for each sensor row."""
+    for k, sensor in enumerate(model.sensors):
+        own = (events.kind == READING) & (events.channel == k)
+        for column, row in enumerate(sensor.rows):
+            yield sensor.name, row.name, column, own & np.isfinite(events.value[:, column])
 
 
 def find_repeats(t: np.ndarray, values: np.ndarray) -> Finding:

@@ -61,12 +61,8 @@ class AssetTunings:
         own = ~np.isnan(column)
         if not own.any():
             return
-        # The extremes: where these are in range, so are the others.
-        for k in (int(np.nanargmin(column)), int(np.nanargmax(column))):
-            try:
-                tuning.set(key, float(column[k]))
-            except ConfigError as error:
-                raise EstimatorError(f"fleet: asset {assets[k]}: {error}") from None
+        if wrong := out_of_range(tuning, key, column):
+            raise EstimatorError(f"fleet: asset {assets[wrong[0]]}: {wrong[1]}")
         self.columns[group][np.ix_(own, tuning.rows_of(key))] = column[own, None]
 
     def _point(self, name: str, column: np.ndarray) -> None:
@@ -92,3 +88,14 @@ class AssetTunings:
     def tuning(self, k: int) -> Tuning:
         """Return the tuning of asset k."""
         return replace(self._machine.tuning, **{group: column[k].copy() for group, column in self.columns.items()})
+
+
+def out_of_range(tuning: Tuning, key: str, column: np.ndarray) -> tuple[int, str] | None:
+    """Return the position of a value (assets,) that is out of range and the reason; None if all are in range or NaN."""
+    # The extremes: where these are in range, so are the others.
+    for k in (int(np.nanargmin(column)), int(np.nanargmax(column))) if not np.isnan(column).all() else ():
+        try:
+            tuning.set(key, float(column[k]))
+        except ConfigError as error:
+            return k, str(error)
+    return None

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 import time
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from concurrent.futures import Executor
 from dataclasses import dataclass, field, replace
 from functools import cached_property
@@ -14,7 +14,7 @@ import numpy as np
 
 from estimators.diagnostics.detectors import detector_of
 from estimators.diagnostics.episodes import Episode, episodes
-from estimators.diagnostics.repeats import Finding, find_repeats
+from estimators.diagnostics.repeats import Finding, find_repeats, sensor_rows
 from estimators.diagnostics.score import score
 from estimators.diagnostics.sensitivity import Gramian, gramian
 from estimators.diagnostics.sensitivity.checklist import MIN_DIFFERENCE, Linearity, linearity
@@ -62,7 +62,7 @@ def without_faults(twin: Twin, log: Log, known: Sequence[Episode] | None = None)
         known = episodes(Measured(twin, log).folded(twin.estimator).fold)
     t, clean = log.t[: log.n] * 1e-9, log.copy()
     found: list[Exclusion] = []
-    for sensor, row, column, readings in _rows_of(twin.model, log):
+    for sensor, row, column, readings in sensor_rows(twin.model, log.events.select(slice(0, log.n))):
         left_out, listed = np.zeros(log.n, bool), []
         for item in known:
             detector = detector_of(item.cause)
@@ -83,17 +83,9 @@ def repeats_of(model: StateSpaceModel, log: Log) -> dict[str, Finding]:
     """Return how the measurements of each sensor row repeat."""
     return {
         row: find_repeats(log.t[: log.n][known], log.value[: log.n, column][known])
-        for _, row, column, known in _rows_of(model, log)
+        for _, row, column, known in sensor_rows(model, log.events.select(slice(0, log.n)))
         if known.any()
     }
-
-
-def _rows_of(model: StateSpaceModel, log: Log) -> Iterator[tuple[str, str, int, np.ndarray]]:
-    """Yield sensor, name and column of each sensor row, and which events of the log (N,) have a value of it."""
-    for k, sensor in enumerate(model.sensors):
-        own = (log.kind[: log.n] == READING) & (log.channel[: log.n] == k)
-        for column, row in enumerate(sensor.rows):
-            yield sensor.name, row.name, column, own & np.isfinite(log.value[: log.n, column])
 
 
 def repeat_lines(found: Mapping[str, Finding]) -> list[str]:
