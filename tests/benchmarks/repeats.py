@@ -72,5 +72,5 @@ def repeats() -> Iterator[BenchmarkRow]:
         figures = {}
         for step in STEPS_OF_NOISE:
             courses = [rows(np.random.default_rng(seed), q, step) for seed in SEEDS for q in (0.002, 0.02, 0.2)]
-            figures[f"{step:g}"] = 100.0 * np.mean([found(y).kind in kinds for y in courses])
+            figures[f"{step:g}"] = 100.0 * float(np.mean([found(y).kind in kinds for y in courses]))
         yield BenchmarkRow(name, figures, remark=f"else {SINGLE or 'each row a measurement'} or undecided")
