@@ -17,7 +17,6 @@ import numpy as np
 from can.io.blf import LOG_CONTAINER, LOG_CONTAINER_STRUCT, NO_COMPRESSION, OBJ_HEADER_BASE_STRUCT
 
 from ..units import to_ns
-from .readers import Raw, refused
 
 KEY_BITS, REMOTE_FLAG = 0x9FFFFFFF, 0x80  # The highest bit of an id is that of an extended frame, as in `EXTENDED`.
 CAN_MESSAGE, CAN_MESSAGE2 = 1, 86
@@ -36,12 +35,11 @@ LAYOUTS = {
 
 
 class BlfBlocks(can.BLFReader):
-    """python-can's reader, whose items are the frames of a block as `Raw` where possible, otherwise its messages."""
+    """python-can's reader, whose items are the columns of a block where possible, otherwise its messages."""
 
     _tail: bytes
-    bad = 0
-    """Blocks that could not be read."""
-    fault = ""
+    bad: tuple[tuple[str, object], ...] = ()
+    """Places of the blocks that could not be read, and why."""
 
     def __iter__(self) -> Iterator[Any]:
         begin = self.file.tell()
@@ -61,12 +59,10 @@ class BlfBlocks(can.BLFReader):
                 if self.file.tell() == place + size + size % 4:
                     continue
             except Exception as wrong:  # noqa: BLE001  a damaged file makes python-can raise anything
-                error = wrong
+                error, self._tail = wrong, b""
             # A wrong length may have passed over blocks; that of the last one of a file that is cut has none after it.
             if self._seek_block(begin + len(MARK)) or error:
-                self._tail = b"" if error else self._tail
-                self.bad += 1
-                self.fault = refused(self.fault, self.bad, "block", f"at byte {place}", error or "its length is wrong")
+                self.bad += ((f"at byte {place}", error or "its length is wrong"),)
 
     def _seek_block(self, place: int) -> bool:
         """Move to the first block from a place on, or to the end; return whether there is one."""
@@ -91,11 +87,11 @@ class BlfBlocks(can.BLFReader):
         yield block
 
 
-def frames_of(data: bytes, start: float) -> tuple[Raw, int] | None:
+def frames_of(data: bytes, start: float) -> tuple[tuple[Any, ...], int] | None:
     """Return the CAN messages of a block and where its last whole object ends; None if python-can must read it.
 
-    Numbers of buses stand in place of positions; the bytes (n, 8) are zero beyond the length; the total counts the
-    remote frames too.
+    They are columns as in `readers.Raw`, with numbers of buses in place of positions; the bytes (n, 8) are zero beyond
+    the length, and the total counts the remote frames too.
 
     Args:
         data: The block, decompressed, after what the one before it left over.
@@ -139,7 +135,7 @@ def frames_of(data: bytes, start: float) -> tuple[Raw, int] | None:
     # As python-can rounds: first the product with 1e-5 or 1e-9, exact before it is rounded, then the sum.
     seconds = frames["time"] / np.where(frames["flags"] == 1, 1e5, 1e9) + start
     length = np.minimum(frames["dlc"], 8).astype(np.int64)
-    block = Raw(
+    block = (
         to_ns(seconds),
         (frames["id"] & KEY_BITS).astype(np.int64),
         frames["channel"].astype(np.int64) - 1,

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import logging
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from functools import lru_cache
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -390,10 +390,17 @@ def ends_of(databases: list[tuple[Path, BusName]], channel: Channel) -> tuple[tu
     Raises:
         SourceError: If no database has it, or a unit does not convert.
     """
-    message, found = find_messages(databases, channel)[0][0], []
+    found = slopes(find_messages(databases, channel)[0][0], channel)
+    return tuple(tuple(slope * end + shift for end in span_of(signal)[:2]) for signal, slope, shift in found)
+
+
+def slopes(message: Any, channel: Channel) -> Iterator[tuple[Any, float, float]]:
+    """Yield each signal of a channel with slope and shift of its conversion to the model's unit.
+
+    Raises:
+        SourceError: If a unit does not convert.
+    """
     for k, name in enumerate(channel.signals):
-        signal = message.get_signal_by_name(name)
-        factor, shift = declared_conversion(channel.units[k], signal.unit, channel.model_units[k], name)
-        ends = (channel.scale[k] * (factor * end + shift) + channel.offset[k] for end in span_of(signal)[:2])
-        found.append(tuple(ends))
-    return tuple(found)
+        signal, unit = message.get_signal_by_name(name), channel.model_units[k]
+        factor, shift = declared_conversion(channel.units[k], signal.unit, unit, f"{channel.name}: {name}")
+        yield signal, channel.scale[k] * factor, channel.scale[k] * shift + channel.offset[k]

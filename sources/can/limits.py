@@ -64,9 +64,10 @@ def span_of(signal: Any) -> tuple[float, float, bool]:
     """
     scale, offset, bits = float(signal.conversion.scale), float(signal.conversion.offset), signal.length
     low, high = float(signal.minimum or 0.0), float(signal.maximum or 0.0)
-    raw = (-(1 << bits - 1), (1 << bits - 1) - 1) if signal.is_signed else (0, (1 << bits) - 1)
+    first = -(1 << bits - 1) if signal.is_signed else 0
+    raw = first, first + (1 << bits) - 1
     least, most = (-np.inf, np.inf) if signal.is_float else sorted(scale * end + offset for end in raw)
-    placeholder = (low, high) == raw and (scale, offset) != (1.0, 0.0)
+    placeholder = (low, high) == raw != (least, most)
     if least - abs(scale) <= low < high <= most + abs(scale) and not placeholder:
         return max(low, least), min(high, most), True
     return least, most, False

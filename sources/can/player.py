@@ -15,9 +15,8 @@ from estimators.errors import SourceError
 from estimators.log import INPUT, READING, TRUTH, Events
 
 from ..source import Channel, Report, Source, ignore
-from ..units import declared_conversion
 from .bus import open_bus
-from .decoder import BusName, find_messages
+from .decoder import BusName, find_messages, slopes
 from .limits import span_of
 
 INPUT_REPEAT_NS = 1_000_000_000  # ns after which an unchanged input is sent again
@@ -200,15 +199,11 @@ class Encoder:
             frame = self._frames.setdefault(message.name, _Frame(message))
             frame.reads = frame.reads or channel.kind == READING
             rows = []
-            for k, name in enumerate(channel.signals):
-                signal = message.get_signal_by_name(name)
-                where = f"{channel.name}: {name}"
-                factor, shift = declared_conversion(channel.units[k], signal.unit, channel.model_units[k], where)
-                slope = channel.scale[k] * factor
+            for signal, slope, shift in slopes(message, channel):
                 if slope == 0.0:
-                    raise SourceError(f"{where}: scale is 0; it must differ from 0")
-                rows.append((name, slope, channel.scale[k] * shift + channel.offset[k], *span_of(signal)[:2]))
-                frame.wanted.add(name)
+                    raise SourceError(f"{channel.name}: {signal.name}: scale is 0; it must differ from 0")
+                rows.append((signal.name, slope, shift, *span_of(signal)[:2]))
+                frame.wanted.add(signal.name)
             for condition in channel.where:
                 signal = message.get_signal_by_name(condition.signal)
                 low, high, _ = span_of(signal)

@@ -79,8 +79,8 @@ def read_messages(path: Path, wanted: frozenset[int] | None, longest: int) -> It
             try:
                 # One by one, so that frames before the fault are kept.
                 for message in islice(messages, size):
-                    if isinstance(message, Raw):
-                        block = message
+                    if isinstance(message, tuple):
+                        block = Raw(*message)
                         break
                     chunk.append(message)
             except SourceError:
@@ -99,12 +99,9 @@ def read_messages(path: Path, wanted: frozenset[int] | None, longest: int) -> It
             elif fault or len(chunk) < size:
                 break
             size = CHUNK_FRAMES
-        fault = (
-            fault
-            or getattr(reader if lines is None else lines, "fault", "")
-            or warned.fault
-            or _missing_end(path, reader)
-        )
+        if bad := getattr(reader, "bad", ()):
+            fault = refused("", len(bad), "block", *bad[0])
+        fault = fault or (lines.fault if lines is not None else "") or warned.fault or _missing_end(path, reader)
         if broken:
             fault = fault or f"{broken} frames hold no numbers"
     finally:
