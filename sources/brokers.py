@@ -19,10 +19,10 @@ from typing import Any, Protocol
 import numpy as np
 
 from estimators.errors import ConfigError, printable, quoted
-from estimators.log import Events
 
 from .messages import LATEST, MAX_WAITING, REFUSED, Messages
 from .source import Report
+from .tables.text import no_value
 
 NO_BROKER = "no broker"  # Key of the times at which the connection was lost
 REFUSED_MESSAGE = "message refused"  # Key of messages that cannot be read
@@ -123,7 +123,9 @@ class TopicMap:
             # NaN is no JSON; who sends it has no value.
             body = json.loads(payload, parse_constant=lambda _: None)
         except (ValueError, RecursionError):
-            raise ValueError("the payload is no JSON and no number") from None
+            body = payload.decode(errors="replace")
+            if not no_value("", body):
+                raise ValueError("the payload is no JSON and no number") from None
         asset = {} if self.asset is None else {"asset": topic.split("/")[self.asset]}
         if not self.values:
             if not isinstance(body, dict):
@@ -227,6 +229,7 @@ class MqttSource:
             by_hand: Acknowledge messages once they have been stored, see `Acknowledging`; connect after `restore`.
         """
         self.messages, self._qos, self._report = messages, qos, report
+        self.now = messages.now
         self._subscribed_to = [*topics] if subscribed is None else [*subscribed]
         self._place, self._section = f"{section.host}:{section.port}", section
         self._client = mqtt_client(
@@ -364,10 +367,6 @@ class MqttSource:
             self._client.ack(mid, 1)
         self._unstored.clear()
 
-    def now(self) -> int | None:
-        """Return the present time by the clock of the senders, ns."""
-        return self.messages.now()
-
     def close(self) -> None:
         """Disconnect."""
         self._client.on_disconnect = None
@@ -400,6 +399,7 @@ class OpcUaSource:
         except ModuleNotFoundError:
             raise ConfigError("OPC UA needs asyncua: pip install 'nisus[service]'") from None
         self._messages, self._url, self._period = messages, url, period
+        self.read, self.now = messages.read, messages.now
         self._names: dict[str, str] = {}
         for name, node in nodes.items():
             try:
@@ -451,14 +451,6 @@ class OpcUaSource:
         answer = self._messages.send([message])[0]
         if answer.status == REFUSED:
             self._report(REFUSED_MESSAGE, f"{name}: {answer.reason}; it is not used")
-
-    def read(self, timeout: float) -> Events | None:
-        """Return the events of the next values."""
-        return self._messages.read(timeout)
-
-    def now(self) -> int | None:
-        """Return the present time by the clock of the server, ns."""
-        return self._messages.now()
 
     def close(self) -> None:
         """Disconnect."""

@@ -18,7 +18,7 @@ from estimators.log import Events
 
 from .mapping import ABSENT, PRESENT, ChannelMapping
 from .source import AssetEvents, Channel, Report, ignore
-from .tables.text import TextMatch, column_of
+from .tables.text import TextMatch, column_of, no_value
 from .tables.times import ns_of_iso
 
 ACCEPTED, DUPLICATE, REFUSED = "accepted", "duplicate", "refused"
@@ -112,12 +112,13 @@ class Messages:
 
     A message is `{"time": ..., "values": {"LT101": 1.2}, "source": "plc", "sequence": 7}`. Its time is ISO 8601 with an
     offset, or ns since 1970; without one it is that of its arrival. Values are numbers, texts for conditions on texts,
-    or null for a missing value. A message with the source and sequence number of an earlier one is a duplicate.
+    or null or a word of quality such as "Bad" for a missing value. A message with the source and sequence number of an
+    earlier one is a duplicate.
 
     Args:
         channels: What feeds the model; their signals are names of values.
         width: Value columns of an event.
-        report: Receives measurements that a condition rejects.
+        report: Receives measurements that a condition rejects, and words of quality.
         assets: Whether each message has the name of its asset, as `"asset": "pump 3"`; `read` returns `AssetEvents`.
 
     Raises:
@@ -130,7 +131,7 @@ class Messages:
         self, channels: Iterable[Channel], *, width: int, report: Report = ignore, assets: bool = False
     ) -> None:
         channels = list(channels)
-        self._width, self._assets = width, assets
+        self._width, self._report, self._assets = width, report, assets
         self.fields = (*FIELDS, ASSET) if assets else FIELDS
         """Fields of a message."""
         self._columns = list(dict.fromkeys(name for channel in channels for name in channel.needed))
@@ -235,6 +236,8 @@ class Messages:
                     values[k] = value
                 except OverflowError:
                     return Answer(REFUSED, f"{shown_name(name)} is {_shown(value)}, which is too large")
+            elif isinstance(value, str) and (word := no_value(name, value)):
+                self._report(*word)
             elif value is not None:
                 return Answer(
                     REFUSED, f"{shown_name(name)} is {_shown(value)}; it must be a number, or null if missing"

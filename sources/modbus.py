@@ -9,7 +9,6 @@ from collections.abc import Mapping
 from typing import Any, NamedTuple
 
 from estimators.errors import ConfigError, printable
-from estimators.log import Events
 
 from .brokers import NO_BROKER, REFUSED_MESSAGE, RETRY_S
 from .messages import REFUSED, Messages
@@ -98,6 +97,7 @@ class ModbusSource:
             raise ConfigError("Modbus needs pymodbus: pip install 'nisus[service]'") from None
         logging.getLogger("pymodbus").addHandler(logging.NullHandler())  # what it logs is reported here, in one line
         self._messages, self._registers, self._report = messages, registers, report
+        self.read, self.now = messages.read, messages.now
         self._place, self._device, self._period = f"{host}:{port}", device, period
         self._client: Any = ModbusTcpClient(host, port=port, timeout=ANSWER_TIMEOUT_S, retries=0)
         self._ask = {
@@ -159,14 +159,6 @@ class ModbusSource:
         kind = self._client.DATATYPE[item.type.upper()]
         words = answer.registers[at : at + item.size]
         return float(self._client.convert_from_registers(words, kind, word_order=item.words))
-
-    def read(self, timeout: float) -> Events | None:
-        """Return the events of the next values."""
-        return self._messages.read(timeout)
-
-    def now(self) -> int | None:
-        """Return the present time by the clock of this machine, ns."""
-        return self._messages.now()
 
     def close(self) -> None:
         """Disconnect."""

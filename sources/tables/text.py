@@ -241,6 +241,13 @@ def _number(cell: str) -> float:
     return float(cell)
 
 
+def no_value(name: str, text: str) -> tuple[str, str] | None:
+    """Return key and text of the report of a word of quality in place of a value; None of any other text."""
+    if not QUALITY_WORD.fullmatch(word := text.strip()):
+        return None
+    return f"{NO_VALUE}{name}: {word[:40]}", f"{name} is {quoted(word)}; the value is missing"
+
+
 def fill(
     name: str | TextMatch,
     cells: list[str],
@@ -272,10 +279,8 @@ def fill(
             if not cell.strip():
                 blank[k] = True
             elif cell.strip().lower() not in ("na", "n/a", "null", "none"):
-                if QUALITY_WORD.fullmatch(word := cell.strip()):
-                    problem(
-                        f"{NO_VALUE}{name}: {word[:40]}", lines[k], f"{name} is {quoted(word)}; the value is missing"
-                    )
+                if word := no_value(name, cell):
+                    problem(word[0], lines[k], word[1])
                     continue
                 point = _with_point(cell)
                 why = "which is not a number" if point is None else f"with a decimal comma; write {point}"

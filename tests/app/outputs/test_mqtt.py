@@ -243,6 +243,7 @@ def test_a_source_that_cannot_be_is_refused_in_one_line(source, text, monkeypatc
 def test_times_in_numbers_are_exact(value, unit, ns):
     topic = TopicMap(values={"a": "v"}, time="t", unit=unit)
     assert topic.message("x", json.dumps({"v": 1, "t": value}).encode())["time"] == ns
+    assert TopicMap(values={"a": ""}).message("x", b"No Data")["values"] == {"a": "No Data"}
 
 
 def test_a_receiver_at_the_broker_needs_one():

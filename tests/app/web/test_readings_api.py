@@ -13,7 +13,7 @@ from app.twin.twin import load_twin
 from estimators import fold
 from estimators.log import Log
 from sources.messages import Messages, SentNumbers
-from sources.source import Channel, Condition, ignore
+from sources.source import Accuracy, Channel, Condition, ignore
 from sources.tables.text import TextMatch
 from tests.app.served import ServedEngine
 from tests.support import SECOND
@@ -219,19 +219,21 @@ def test_a_twin_with_another_source_says_so(serve):
     assert found["error"].endswith("is of type simulator; only one of type push takes messages")
 
 
-def test_units_and_conditions_are_those_of_a_table():
+def test_units_conditions_and_words_of_quality_are_those_of_a_table():
+    keys: list[str] = []
     channels = [
         Channel(
-            0, 0, "level", ("LT101",), units=("mm",), model_units=("m",), scale=(2.0,),
+            0, 0, "level", ("LT101",), units=("mm",), model_units=("m",), scale=(2.0,), accuracy=Accuracy(("s",)),
             where=(Condition(TextMatch("quality", ("Good",)), 1.0, 1.0),),
         ),
     ]  # fmt: skip
-    source = Messages(channels, width=1)
-    assert source.names == ("LT101", "quality")
-    rows = [{"LT101": 1500, "quality": quality} for quality in ("Good", "Bad")]
-    assert {answer.status for answer in source.send([{"values": row} for row in rows])} == {"accepted"}
-    events = source.read(0.0)
-    np.testing.assert_array_equal(events.value[:, 0], [3.0, np.nan])
+    source = Messages(channels, width=1, report=lambda key, _: keys.append(key))
+    assert source.names == ("LT101", "s", "quality")
+    columns = [1500] * 3 + ["I/O Timeout"], [0.5, 0.5, "Bad", 1], ["Good", "Bad", "Good", "Good"]
+    messages = [{"values": dict(zip(source.names, row, strict=True))} for row in zip(*columns, strict=True)]
+    assert {answer.status for answer in source.send(messages)} == {"accepted"}
+    np.testing.assert_array_equal(source.read(0.0).value[:, 0], [3.0, *[np.nan] * 3])
+    assert {"unknown accuracy level", "no value s: Bad", "no value LT101: I/O Timeout"} < set(keys)
     assert len(source.read(0.0)) == 0
 
 

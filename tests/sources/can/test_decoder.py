@@ -12,7 +12,7 @@ from estimators.errors import SourceError
 from estimators.log import INPUT, READING, TRUTH
 from sources.can.decoder import Decoder, ends_of
 from sources.source import Accuracy, Channel, Condition
-from tests.sources.can.can_tools import Reports, dbc, frame, sensor
+from tests.sources.can.can_tools import DBC, Reports, dbc, frame, sensor
 
 
 def random_dbc(rng):
@@ -252,17 +252,17 @@ def test_a_recording_decodes_as_cantools_does(data):
 
 
 def test_a_frame_brings_the_noise_of_its_reading(tmp_path):
-    """Squared, in columns of their own; zero or cut off it leaves the tuned R, negative the value out; both counted."""
-    reports = Reports()
+    """Squared, in columns of their own; zero or cut off it leaves the tuned R, unknown it leaves the value out."""
+    reports, database = Reports(), dbc(tmp_path, DBC + 'VAL_ 256 Torque 2 "SNA" ;\n')
     accuracy = Accuracy(("Torque",), units=("cm",), scale=(0.5,))
     fix = Channel(
         READING, 0, "engine", ("Temp", "Rpm"), "ENGINE", units=("m", "m"), model_units=("m", "m"), accuracy=accuracy
     )
-    decoder = Decoder([(dbc(tmp_path), None)], [fix, sensor(1, "FIX", "Lat")], width=3, report=reports)
-    database = cantools.database.load_file(dbc(tmp_path), strict=False)
+    decoder = Decoder([(database, None)], [fix, sensor(1, "FIX", "Lat")], width=3, report=reports)
+    database = cantools.database.load_file(database, strict=False)
     data = [
         database.encode_message("ENGINE", {"Temp": 20.0, "Rpm": 800.0, "Torque": torque, "Ok": 1})
-        for torque in (300.0, 0.0, -5.0)
+        for torque in (300.0, 0.0, -5.0, 1.0)
     ]
     frames = [frame(256, item) for item in (*data, data[0][:4])] + [frame(258, bytes(8))]
     batch = decoder.decode(decoder.gather(frames, None))
@@ -273,12 +273,13 @@ def test_a_frame_brings_the_noise_of_its_reading(tmp_path):
             [20.0, 800.0, nan, (0.01 * 300.0 * 0.5) ** 2, (0.01 * 300.0 * 0.5) ** 2],
             [20.0, 800.0, nan, nan, nan],
             [nan, nan, nan, nan, nan],
+            [nan, nan, nan, nan, nan],
             [20.0, 800.0, nan, nan, nan],
             [0.0, nan, nan, nan, nan],
         ],
         rtol=1e-14,
     )
-    assert reports.counts == {"accuracy engine": 2, "unknown accuracy engine": 1}
+    assert reports.counts == {"accuracy engine": 2, "unknown accuracy engine": 2, "no value ENGINE.Torque": 1}
     assert reports.texts["accuracy engine"].startswith(
         "engine: Torque has no positive standard deviation of a measurement"
     )
