@@ -86,7 +86,7 @@ def read_messages(path: Path, wanted: frozenset[int] | None, longest: int) -> It
             except SourceError:
                 raise
             except Exception as error:  # noqa: BLE001  as above
-                fault = gist(error)
+                fault = f"{gist(error)} after frame {count + len(chunk)}"
             count += len(chunk)
             errors += sum(message.is_error_frame for message in chunk)
             if chunk or block is None:

@@ -1,6 +1,7 @@
 """Logs: written with python-can and read back equal, in every format; recordings; files that are damaged."""
 
 import gzip
+import re
 import shutil
 import threading
 
@@ -126,10 +127,12 @@ def test_a_cut_database_and_archive_say_so(tmp_path, messages):
         content = (tmp_path / source).read_bytes()
         (tmp_path / cut).write_bytes(content[: int(len(content) * 0.7)])
         try:
-            _, reports = read(tmp_path / cut, decoder_of(tmp_path))
-            assert reports.counts["truncated file"] == 1
+            assert read(tmp_path / cut, decoder_of(tmp_path))[1].counts["truncated file"] == 1
         except SourceError as error:
             assert str(tmp_path / cut) in str(error) and "\n" not in str(error)
+    (tmp_path / "d.db").write_bytes(content[:20480] + bytes(4096) + content[24576:])
+    told = str(read(tmp_path / "d.db", decoder_of(tmp_path))[1].texts)
+    assert re.search(r"d.db: the file is damaged \(.* malformed after frame (\d{3})\); \1 frames were read", told)
 
 
 def test_a_database_whose_last_page_is_cut_says_so(tmp_path, messages):
