@@ -57,6 +57,11 @@ def is_blank(name: str) -> bool:
     return not any(letter.isprintable() and not letter.isspace() for letter in name)
 
 
+def spaced(unit: str) -> str:
+    """Return a unit as it follows a number; nothing for dimensionless quantities."""
+    return f" {unit}" if unit and unit != "1" else ""
+
+
 def digits(value: float, sign: str = "") -> str:
     """Format a number with three digits, with an exponent only where that is shorter: `2,280`, `0.0375`, `1.8e+10`.
 

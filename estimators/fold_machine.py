@@ -309,8 +309,7 @@ class Machine:
 
 def variances_of(cov: np.ndarray) -> np.ndarray:
     """Return the diagonal (nx,) of a covariance, or the variances (1, nx) of a large state as (nx,)."""
-    variances: np.ndarray = cov[0] if len(cov) == 1 else np.diag(cov)
-    return variances
+    return cov[0] if len(cov) == 1 else np.diag(cov)
 
 
 def scratch(size: int) -> np.ndarray:

@@ -168,8 +168,7 @@ def _future(model: StateSpaceModel, base: Base, instants: np.ndarray, inputs: Ev
 def _quantiles(points: np.ndarray, mean: np.ndarray, model: StateSpaceModel) -> np.ndarray:
     """Return quantiles (4, shown) of members (k, shown) at `SIGMAS`, about their mean (shown,); angles are wrapped."""
     off = wrapped(points - mean, [state.circular for state in model.shown_states])
-    found: np.ndarray = mean + np.quantile(off, ndtr(SIGMAS), axis=0)
-    return found
+    return mean + np.quantile(off, ndtr(SIGMAS), axis=0)
 
 
 class _Watch:

@@ -6,8 +6,9 @@ from typing import Any, NamedTuple
 
 import numpy as np
 from numba import types
+from numba.extending import register_jitable
 
-from .numerics.jit import B1, F1, F2, I1, borrowed, part
+from .numerics.jit import B1, F1, F2, I1, borrowed
 
 NONE, USED, GATED, HELD_OUT, MISSING, FAILED, SCREENED = range(7)
 """Verdict on an event: not a measurement; used; rejected by the gate; held out and scored; no finite row; failed, as S
@@ -77,16 +78,9 @@ class Track(NamedTuple):
     @staticmethod
     def allocate(rows: int, nx: int, pairs: int, ny: int, width: int | None = None) -> Track:
         """Allocate columns for `rows` events; a row has values, and memory, once its event is folded."""
-        matrix = [np.empty((rows, k)) for k in (nx, nx, pairs, ny, ny)]
-        vectors = [np.empty(rows) for _ in range(2)]
-        codes = [np.empty(rows, np.int32), np.empty(rows, np.int8)]
-        windowed = [np.empty(rows) for _ in range(4)]
-        health = [np.empty(rows, np.int8) for _ in range(2)]
-        evidence = [np.empty((rows, ny)), np.empty((rows, width or ny), np.int32), np.empty(rows, np.int64)]
-        screened = np.empty((rows, ny), np.int8)
-        particles = [np.empty(rows) for _ in range(2)]
-        columns: list[Any] = [*matrix, *vectors, *codes, *windowed, *health, *evidence, screened, *particles]
-        return Track(*columns)
+        widths = iter((nx, nx, pairs, ny, ny, ny, width or ny, ny))
+        shapes = ((rows, next(widths)) if kind.ndim == 2 else rows for kind in track_type.types)
+        return Track(*(np.empty(shape, str(kind.dtype)) for shape, kind in zip(shapes, track_type.types, strict=True)))
 
     def select(self, index: object) -> Track:
         """Return the rows that a slice, mask or index array selects."""
@@ -116,29 +110,6 @@ track_type = types.NamedTuple(
 )
 
 
-@part
-def borrowed_columns(track):
-    """Return the same columns, not reference-counted."""
-    return Track(
-        borrowed(track.mean),
-        borrowed(track.std),
-        borrowed(track.cross),
-        borrowed(track.innovation),
-        borrowed(track.innovation_std),
-        borrowed(track.nis),
-        borrowed(track.log_likelihood),
-        borrowed(track.dof),
-        borrowed(track.verdict),
-        borrowed(track.age),
-        borrowed(track.nis_mean),
-        borrowed(track.nis_low),
-        borrowed(track.nis_high),
-        borrowed(track.consistency),
-        borrowed(track.health),
-        borrowed(track.whitened),
-        borrowed(track.alarms),
-        borrowed(track.flags),
-        borrowed(track.screened),
-        borrowed(track.effective),
-        borrowed(track.ancestors),
-    )
+_columns = ", ".join(f"borrowed(track.{name})" for name in Track._fields)
+borrowed_columns = register_jitable(eval(f"lambda track: Track({_columns})", {"Track": Track, "borrowed": borrowed}))
+"""Return the same columns, not reference-counted."""

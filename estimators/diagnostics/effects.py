@@ -119,8 +119,7 @@ def _alone(e: np.ndarray) -> np.ndarray:
     """Return which of e (n,) are outliers without a neighbouring one on the same side."""
     side = np.where(np.abs(e) > OUTLIER_FROM_SIGMA, np.sign(e), 0.0)
     beside = np.concatenate(([0.0], side, [0.0]))
-    alone: np.ndarray = (side != 0.0) & (beside[:-2] != side) & (beside[2:] != side)
-    return alone
+    return (side != 0.0) & (beside[:-2] != side) & (beside[2:] != side)
 
 
 class Sums(NamedTuple):

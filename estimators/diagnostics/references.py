@@ -7,6 +7,7 @@ from typing import NamedTuple
 
 import numpy as np
 
+from ..errors import spaced
 from ..events.batch import Events, truth_of
 from ..model.state_space import Input, State, StateSpaceModel
 from ..numerics.linalg import wrapped
@@ -29,8 +30,7 @@ class Reference(NamedTuple):
     @property
     def log_density(self) -> np.ndarray:
         """Log density of the reference under its prediction, (n,)."""
-        found: np.ndarray = -0.5 * (self.error / self.std) ** 2 - np.log(self.std) - 0.5 * np.log(2.0 * np.pi)
-        return found
+        return -0.5 * (self.error / self.std) ** 2 - np.log(self.std) - 0.5 * np.log(2.0 * np.pi)
 
     def finite(self) -> Reference:
         """Return the events with a finite error and a positive standard deviation."""
@@ -62,8 +62,7 @@ HALF_WIDTH = 1.959963984540054  # Half-width of a 95 % band, in standard deviati
 def withheld(model: StateSpaceModel, track: Track) -> np.ndarray:
     """Return where the estimate of a shown state is withheld, (n, shown): its 95 % band is wider than its limit."""
     limits = np.array([state.withhold for state in model.shown_states])
-    found: np.ndarray = track.std > limits / HALF_WIDTH
-    return found
+    return track.std > limits / HALF_WIDTH
 
 
 def shown_track(model: StateSpaceModel, track: Track) -> Track:
@@ -76,8 +75,7 @@ def hidden_states(model: StateSpaceModel, cov: np.ndarray) -> np.ndarray:
     """Return the indices of the states whose estimate is withheld, given a covariance (nx, nx) or variances (1, nx)."""
     variance = np.diag(cov) if len(cov) == model.nx else cov[0]
     limits = np.array([state.withhold for state in model.shown_states])
-    found: np.ndarray = np.asarray(model.shown)[variance[model.shown] > (limits / HALF_WIDTH) ** 2]
-    return found
+    return np.asarray(model.shown)[variance[model.shown] > (limits / HALF_WIDTH) ** 2]
 
 
 WITHHELD = "withheld"  # Grade of a state beside those of health
@@ -113,13 +111,13 @@ def withheld_reasons(model: StateSpaceModel, track: Track, u: np.ndarray) -> dic
     items: tuple[State | Input, ...] = (*model.shown_states, *model.inputs)
     places = [(item.name, item.unit, item.fitted) for item in items]
     left = [
-        f"{name} {value:.4g}{_unit(unit)}, fitted at {limits[0]:.4g} to {limits[1]:.4g}"
+        f"{name} {value:.4g}{spaced(unit)}, fitted at {limits[0]:.4g} to {limits[1]:.4g}"
         for (name, unit, limits), value in zip(places, (*mean, *u), strict=True)
         if limits is not None and not limits[0] <= value <= limits[1]
     ]
     why = f"outside the fitted range ({'; '.join(left)})" if left else "too uncertain"
     return {
-        state.name: f"{why}, ± {_two_digits(HALF_WIDTH * deviation)}{_unit(state.unit)}"
+        state.name: f"{why}, ± {_two_digits(HALF_WIDTH * deviation)}{spaced(state.unit)}"
         for state, deviation, hidden in zip(model.shown_states, std, withheld(model, track)[-1], strict=True)
         if hidden
     }
@@ -127,10 +125,6 @@ def withheld_reasons(model: StateSpaceModel, track: Track, u: np.ndarray) -> dic
 
 def _two_digits(value: float) -> str:
     return f"{float(f'{value:.2g}'):g}"
-
-
-def _unit(unit: str) -> str:
-    return "" if unit in ("", "1") else f" {unit}"
 
 
 def references(model: StateSpaceModel, events: Events, track: Track) -> list[Reference]:

@@ -31,8 +31,7 @@ def model_versions(events: Events, before: int = 1) -> np.ndarray:
     first = np.concatenate((rows[:1], rows[1:][np.diff(events.t[rows]) > 0]))
     begins = np.zeros(len(events), np.int64)
     begins[first] = 1
-    version: np.ndarray = before + np.cumsum(begins)
-    return version
+    return before + np.cumsum(begins)
 
 
 def versions_dropped(events: Events, count: int) -> int:

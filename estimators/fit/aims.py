@@ -223,5 +223,4 @@ def crps(error: np.ndarray, std: np.ndarray) -> np.ndarray:
     """
     z = error / std
     density = np.exp(-0.5 * z**2) / np.sqrt(2.0 * np.pi)
-    found: np.ndarray = std * (z * (2.0 * ndtr(z) - 1.0) + 2.0 * density - 1.0 / np.sqrt(np.pi))
-    return found
+    return std * (z * (2.0 * ndtr(z) - 1.0) + 2.0 * density - 1.0 / np.sqrt(np.pi))

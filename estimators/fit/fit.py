@@ -257,8 +257,7 @@ def fit(
 
 def _identified(objective: Objective, shape: LikelihoodCurvature) -> np.ndarray:
     """Return the mask of the entries that the data identify, (k,)."""
-    found: np.ndarray = shape.deviation <= MAX_DEVIATION * np.array([item.deviation for item in objective.entries])
-    return found
+    return shape.deviation <= MAX_DEVIATION * np.array([item.deviation for item in objective.entries])
 
 
 def _resettable(

@@ -455,8 +455,7 @@ def polished(objective: Objective, x: np.ndarray, cov: np.ndarray) -> np.ndarray
 
 def _outer(objective: Objective, scores: np.ndarray) -> np.ndarray:
     """Return the curvature (k, k) by the scores (k, n)."""
-    found: np.ndarray = scores @ scores.T + np.diag(objective.precision)
-    return found
+    return scores @ scores.T + np.diag(objective.precision)
 
 
 def _step(H: np.ndarray, slope: np.ndarray, low: np.ndarray, high: np.ndarray) -> np.ndarray:
@@ -486,8 +485,7 @@ def _updated(H: np.ndarray, step: np.ndarray, change: np.ndarray) -> np.ndarray:
         return H
     weight = 1.0 if seen >= DAMPING * present else (1.0 - DAMPING) * present / (present - seen)
     change = weight * change + (1.0 - weight) * along
-    updated: np.ndarray = H - np.outer(along, along) / present + np.outer(change, change) / float(step @ change)
-    return updated
+    return H - np.outer(along, along) / present + np.outer(change, change) / float(step @ change)
 
 
 def search(objective: Objective, x: np.ndarray) -> tuple[np.ndarray, float]:

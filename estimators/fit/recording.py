@@ -56,8 +56,7 @@ def held_out_rows(log: Log, blocks: int = BLOCKS) -> np.ndarray:
         return np.zeros(log.n, bool)
     # Events after the last reading belong to its block.
     block = np.minimum((np.cumsum(reading) - reading) * blocks // count, blocks - 1)
-    held: np.ndarray = block % HELD_OUT_EVERY == HELD_OUT_EVERY - 1
-    return held
+    return block % HELD_OUT_EVERY == HELD_OUT_EVERY - 1
 
 
 def until_last_fitted(recording: Recording) -> Recording:

@@ -82,8 +82,7 @@ class LikelihoodCurvature(NamedTuple):
     @property
     def deviation(self) -> np.ndarray:
         """Standard deviation of every entry (k,)."""
-        found: np.ndarray = np.sqrt(np.diag(self.cov)) * self.widened
-        return found
+        return np.sqrt(np.diag(self.cov)) * self.widened
 
     @property
     def correlation(self) -> np.ndarray:
@@ -93,8 +92,7 @@ class LikelihoodCurvature(NamedTuple):
     @property
     def lines(self) -> np.ndarray:
         """Change of all entries per unit of each, (k, k), along which the parabola drops as its profile."""
-        found: np.ndarray = self.cov / np.diag(self.cov)[:, None]
-        return found
+        return self.cov / np.diag(self.cov)[:, None]
 
 
 def curvature_points(k: int) -> int:
@@ -152,8 +150,7 @@ def curvature(objective: Objective, x: np.ndarray, known: np.ndarray | None = No
 def _scaled(matrix: np.ndarray) -> np.ndarray:
     """Return a positive definite matrix (k, k) scaled to a diagonal of ones."""
     root = np.sqrt(np.diag(matrix))
-    found: np.ndarray = matrix / np.outer(root, root)
-    return found
+    return matrix / np.outer(root, root)
 
 
 def _inverse(H: np.ndarray) -> np.ndarray | None:
@@ -164,8 +161,7 @@ def _inverse(H: np.ndarray) -> np.ndarray | None:
     values, vectors = np.linalg.eigh(H / np.outer(root, root))
     if values[0] <= MIN_CURVATURE * values[-1]:
         return None
-    found: np.ndarray = (vectors / values) @ vectors.T / np.outer(root, root)
-    return found
+    return (vectors / values) @ vectors.T / np.outer(root, root)
 
 
 def _widened(cov: np.ndarray, scores: np.ndarray, precision: np.ndarray) -> np.ndarray:
@@ -178,8 +174,7 @@ def _widened(cov: np.ndarray, scores: np.ndarray, precision: np.ndarray) -> np.n
     sums -= sums.mean(axis=1, keepdims=True)
     J = sums @ sums.T * SCORE_BATCHES / (SCORE_BATCHES - 1.0) + np.diag(precision)
     robust = cov @ J @ cov
-    found: np.ndarray = np.sqrt(np.maximum(1.0, np.diag(robust) / np.diag(cov)))
-    return found
+    return np.sqrt(np.maximum(1.0, np.diag(robust) / np.diag(cov)))
 
 
 def intervals(

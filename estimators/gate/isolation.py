@@ -246,14 +246,12 @@ def cost(nis: np.ndarray, dof: np.ndarray, limit: np.ndarray) -> np.ndarray:
 
 def degrees(track: Track) -> np.ndarray:
     """Return the number of finite rows of each measurement of a track, (N,)."""
-    rows: np.ndarray = np.isfinite(track.innovation_std).sum(axis=1)
-    return rows
+    return np.isfinite(track.innovation_std).sum(axis=1)
 
 
 def softened(track: Track, limits: np.ndarray) -> np.ndarray:
     """Return which rows of a track are measurements beyond the gate that were used, (N,)."""
-    beyond: np.ndarray = (track.verdict == USED) & (track.nis > limits[degrees(track)])
-    return beyond
+    return (track.verdict == USED) & (track.nis > limits[degrees(track)])
 
 
 def log_likelihoods(track: Track, limits: np.ndarray) -> np.ndarray:
@@ -264,8 +262,7 @@ def log_likelihoods(track: Track, limits: np.ndarray) -> np.ndarray:
     """
     dof = degrees(track)
     log_det = 2.0 * np.nansum(np.log(track.innovation_std), axis=1)
-    likelihoods: np.ndarray = -0.5 * (cost(track.nis, dof, limits[dof]) + log_det)
-    return likelihoods
+    return -0.5 * (cost(track.nis, dof, limits[dof]) + log_det)
 
 
 def weigh(
@@ -316,8 +313,7 @@ def widening(cov: np.ndarray, prior: np.ndarray, H: np.ndarray, innovation: np.n
         spread = np.square(H) @ added
         reached = (spread > 0.0) & (nu != 0.0)
         if np.any(reached):
-            widest: np.ndarray = added * float(np.max(nu[reached] ** 2 / spread[reached]))
-            return widest
+            return added * float(np.max(nu[reached] ** 2 / spread[reached]))
     return np.zeros(len(cov))
 
 

@@ -108,23 +108,11 @@ def run(
                             verdict = SCREENED
                         else:
                             with context.brought(sensor, value[i, width:]) if value.shape[1] > width else tuned:
-                                verdict = code.update(
-                                    context, u, sensor, given, index, state, work, innovation, innovation_std, score
-                                )
+                                told_of = context, u, sensor, given, index, state, work
+                                scored = innovation, innovation_std, score
+                                verdict = code.update(*told_of, *scored)
                                 if verdict == GATED and rule.soft:
-                                    verdict = _soften(
-                                        code,
-                                        context,
-                                        u,
-                                        sensor,
-                                        given,
-                                        index,
-                                        state,
-                                        work,
-                                        innovation,
-                                        innovation_std,
-                                        score,
-                                    )
+                                    verdict = _soften(code, told_of, *scored)
                         if verdict in (GATED, USED):
                             beyond = score[0] > limit_of(context.context, sensor, int(score[1]))
                             asked = note(doubt[sensor], rule.most, beyond, index, float(now))
@@ -166,25 +154,16 @@ def run(
 
 
 def _soften(
-    code: Any,
-    context: Any,
-    u: np.ndarray,
-    sensor: int,
-    y: np.ndarray,
-    index: int,
-    state: np.ndarray,
-    work: np.ndarray,
-    innovation: np.ndarray,
-    innovation_std: np.ndarray,
-    score: np.ndarray,
+    code: Any, given: tuple[Any, ...], innovation: np.ndarray, innovation_std: np.ndarray, score: np.ndarray
 ) -> int:
     """Update with inflated noise; see gate/soften.py."""
+    context, _, sensor, y, *_ = given
     w = inflation(context.context, sensor, y, innovation, score[0], int(score[1]))
     if not w < np.inf:
         return GATED
     nu, std, scored = innovation.copy(), innovation_std.copy(), score.copy()
     with context.brought(sensor, w * context.variances(sensor)):
-        verdict = int(code.update(context, u, sensor, y, index, state, work, innovation, innovation_std, score))
+        verdict = int(code.update(*given, innovation, innovation_std, score))
     innovation[:], innovation_std[:] = nu, std
     if verdict == USED:
         scored[LOG_LIKELIHOOD] = score[LOG_LIKELIHOOD]

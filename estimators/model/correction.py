@@ -57,13 +57,11 @@ class GaussianProcess:
     def _near(self, z: np.ndarray) -> np.ndarray:
         """Return κ (N, M) of features z (N, d)."""
         off = z[:, None, :] / self.lengths - self.points / self.lengths
-        near: np.ndarray = np.exp(-0.5 * np.sum(off**2, axis=-1))
-        return near
+        return np.exp(-0.5 * np.sum(off**2, axis=-1))
 
     def mean(self, z: np.ndarray) -> np.ndarray:
         """Return m (N, k) at features z (N, d)."""
-        found: np.ndarray = self._near(z) @ self.data[2]
-        return found
+        return self._near(z) @ self.data[2]
 
     def share(self, z: np.ndarray) -> np.ndarray:
         """Return s (N,) at features z (N, d)."""
@@ -107,14 +105,12 @@ class Ridge:
 
     def _phi(self, z: np.ndarray) -> np.ndarray:
         whole = np.concatenate((z, np.ones((len(z), 1))), axis=1)  # the last column, at -1, is 1
-        phi: np.ndarray = whole[:, self.terms[:, 0]] * whole[:, self.terms[:, 1]]
-        return phi
+        return whole[:, self.terms[:, 0]] * whole[:, self.terms[:, 1]]
 
     def mean(self, z: np.ndarray) -> np.ndarray:
         """Return m (N, k) at features z (N, d)."""
         centre, scale, _, _, _, weights, _ = self.data
-        found: np.ndarray = weight(z, self.data)[:, None] * (self._phi((z - centre) / scale) @ weights)
-        return found
+        return weight(z, self.data)[:, None] * (self._phi((z - centre) / scale) @ weights)
 
     def share(self, z: np.ndarray) -> np.ndarray:
         """Return s (N,) at features z (N, d)."""
@@ -146,8 +142,7 @@ class Net:
 
     def mean(self, z: np.ndarray) -> np.ndarray:
         """Return m (N, k) at features z (N, d)."""
-        found: np.ndarray = weight(z, self.data)[:, None] * self.run(z)
-        return found
+        return weight(z, self.data)[:, None] * self.run(z)
 
     def share(self, z: np.ndarray) -> np.ndarray:
         """Return s (N,) at features z (N, d)."""
@@ -177,8 +172,7 @@ def weight(z: np.ndarray, data: tuple[np.ndarray, ...]) -> np.ndarray:
     centre, scale, precision, reach = data[:4]
     off = (z - centre) / scale
     beyond = np.maximum(0.0, np.sqrt(np.einsum("ni,ij,nj->n", off, precision, off)) - reach[0])
-    g: np.ndarray = np.exp(-0.5 * beyond**2)
-    return g
+    return np.exp(-0.5 * beyond**2)
 
 
 def process_add(x, u, dt, place, target, data, out):

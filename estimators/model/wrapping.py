@@ -118,37 +118,41 @@ def _moments(c, part):
     return mean, square - mean * mean
 
 
-# Each wrapper calls the chances itself: a compiled function that takes another as an argument is not cached.
-def _step(function: Callable, chances: Callable, j: int, count: int) -> Callable:
-    inner, jumping = as_inner(function), as_inner(chances)
+# Each wrapper has a function around the chances: a compiled function that takes another as an argument is not cached.
+def _next_mode(chances: Callable, j: int, count: int) -> Any:
+    """Return a function that sets the mode in z, which it works in, to the mean of the next; return its variance."""
+    jumping = as_inner(chances)
 
-    def f(x, u, p, dt, out):  # noqa: ANN001, ANN202
-        z = x.copy()
-        c = np.empty((2, count), x.dtype)
-        low, part = _between(x[j], count)
+    def settle(z, u, p, dt):  # noqa: ANN001, ANN202
+        c = np.empty((2, count), z.dtype)
+        low, part = _between(z[j], count)
         for k in range(2):
             z[j] = low + k
             jumping(z, u, p, dt, c[k])
-        mean, _ = _moments(c, part)
-        z[j] = mean
+        z[j], variance = _moments(c, part)
+        return variance
+
+    return as_inner(settle)
+
+
+def _step(function: Callable, chances: Callable, j: int, count: int) -> Callable:
+    inner, settle = as_inner(function), _next_mode(chances, j, count)
+
+    def f(x, u, p, dt, out):  # noqa: ANN001, ANN202
+        z = x.copy()
+        settle(z, u, p, dt)
         inner(z, u, p, dt, out)
-        out[j] = mean
+        out[j] = z[j]
 
     return f
 
 
 def _noise(function: Callable, chances: Callable, j: int, count: int) -> Callable:
-    inner, jumping = as_inner(function), as_inner(chances)
+    inner, settle = as_inner(function), _next_mode(chances, j, count)
 
     def Q(x, u, p, q, dt, out):  # noqa: ANN001, ANN202
         z = x.copy()
-        c = np.empty((2, count))
-        low, part = _between(x[j], count)
-        for k in range(2):
-            z[j] = low + k
-            jumping(z, u, p, dt, c[k])
-        mean, variance = _moments(c, part)
-        z[j] = mean
+        variance = settle(z, u, p, dt)
         inner(z, u, p, q, dt, out)
         out[j, j] = max(variance, MIN_MODE_VARIANCE)
 

@@ -7,6 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from ...compiled.model import compile_model
+from ...errors import spaced
 from ...model.state_space import StateSpaceModel
 from ...model.wrapping import indicator
 from ..detectors import since
@@ -15,11 +16,6 @@ CORRELATED_FROM = 0.15  # Lag-1 correlation of the innovations from which Q expl
 
 
 MAX_STATES = 64  # States up to which the states that a sensor observes are listed
-
-
-def spaced(unit: str) -> str:
-    """Return a unit as it follows a number; nothing for dimensionless quantities."""
-    return f" {unit}" if unit and unit != "1" else ""
 
 
 def observed_states(model: StateSpaceModel) -> np.ndarray:

@@ -179,8 +179,7 @@ def _smoothed(series: np.ndarray) -> np.ndarray:
     total = np.concatenate([np.zeros(1), np.cumsum(series)])
     last = np.arange(1, series.size + 1)
     first = np.maximum(last - SMOOTHED - 1, 0)
-    mean: np.ndarray = (total[last] - total[first]) / (last - first)
-    return mean
+    return (total[last] - total[first]) / (last - first)
 
 
 def _at(t: np.ndarray, times: np.ndarray, values: np.ndarray) -> np.ndarray:
