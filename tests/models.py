@@ -17,6 +17,19 @@ def first_state(x, u, p, out):
     out[:] = x[0]
 
 
+def second_state(x, u, p, out):
+    out[0] = x[1]
+
+
+def first_states(x, u, p, out):
+    out[:] = x[: out.size]
+
+
+def constant_speed(x, u, p, dt, out):
+    out[0] = x[0] + dt * x[1]
+    out[1] = x[1]
+
+
 def first_state_squared(x, u, p, out):
     out[0] = x[0] * x[0]
 

@@ -19,6 +19,20 @@ SECOND = 1_000_000_000
 _RESERVED: list[socket.socket] = []
 
 
+class Clock:
+    """Time that passes when a test says so: it sets `now`, or calls `wait` of a clock in ns."""
+
+    def __init__(self, now: float = 0) -> None:
+        self.now = now
+
+    def __call__(self) -> float:
+        return self.now
+
+    def wait(self, seconds: float) -> bool:
+        self.now += round(seconds * SECOND)
+        return False
+
+
 def free_port(kind: socket.SocketKind = socket.SOCK_STREAM) -> int:
     """A port of loopback, of TCP or UDP; on Linux the system gives one of TCP to no other process while this one runs.
 

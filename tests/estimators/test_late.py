@@ -8,13 +8,9 @@ from estimators.late import inflated, moved_variance, rewind_seconds
 from estimators.log import READING, TICK, Events, Log
 from estimators.model.state_space import Noise, Row, Sensor, State, StateSpaceModel
 from estimators.tuning import Tuning
+from tests.models import constant_speed
 from tests.support import SECOND, as_log, assert_same
 from tests.support import folded as advanced
-
-
-def moving(x, u, p, dt, out):
-    out[0] = x[0] + dt * x[1]
-    out[1] = x[1]
 
 
 def place(x, u, p, out):
@@ -34,7 +30,7 @@ MODEL = StateSpaceModel(
         Sensor("twice", (Row("twice", "m", 0.3),), h=place),
         Sensor("angle", (Row("angle", "rad", 0.3, circular=True),), h=bearing),
     ),
-    f=moving,
+    f=constant_speed,
 )
 HORIZON = 5 * SECOND
 

@@ -18,16 +18,11 @@ from estimators.model.state_space import Noise, Row, Sensor, State, StateSpaceMo
 from estimators.models import MODELS
 from estimators.track import DUPLICATE, MISSING, RANGE, RATE, REPEATED, SATURATED, SCREENED, SUSPECT, USED
 from estimators.tuning import Tuning
-from tests.models import first_state, unchanged
+from tests.models import first_state, first_states, unchanged
 from tests.support import SECOND, as_log, folded
 
 BEAT = SECOND // 4
 """Times are multiples of a quarter of a second and values of a quarter of a unit: sums of these are exact."""
-
-
-def two(x, u, p, out):
-    out[0] = x[0]
-    out[1] = x[1]
 
 
 def model(a=None, b=None):
@@ -39,7 +34,7 @@ def model(a=None, b=None):
         noises=(Noise("x", "m²/s", 0.01), Noise("y", "m²/s", 0.01)),
         sensors=(
             Sensor("a", (Row("a", "m", 1 / 16),), h=first_state, limits=a),
-            Sensor("b", (Row("x", "m", 1 / 16), Row("y", "m", 1 / 16)), h=two, limits=b),
+            Sensor("b", (Row("x", "m", 1 / 16), Row("y", "m", 1 / 16)), h=first_states, limits=b),
         ),
         f=unchanged,
         linear=True,

@@ -8,21 +8,8 @@ import pytest
 from estimators.log import Events
 from sources.merged import MemorySource
 from sources.pacer import MAX_BATCH_EVENTS, Pacer
-from tests.support import SECOND, read_all
+from tests.support import SECOND, Clock, read_all
 from tests.waiting import LIMIT_S
-
-
-class Clock:
-    """Nanoseconds that pass when a test says so."""
-
-    def __init__(self):
-        self.now = 7 * SECOND
-
-    def __call__(self):
-        return self.now
-
-    def advance(self, seconds):
-        self.now += round(seconds * SECOND)
 
 
 def events(times):
@@ -32,7 +19,7 @@ def events(times):
 
 
 def player(times=(0, 1, 2, 3, 4, 5), *, batch=2, **more):
-    clock = Clock()
+    clock = Clock(7 * SECOND)
     return Pacer(lambda: MemorySource(events(times), batch=batch), clock=clock, **more), clock
 
 
@@ -49,13 +36,13 @@ def due(pacer):
 def test_events_come_when_playback_reaches_them():
     pacer, clock = player()
     assert due(pacer) == [0]
-    clock.advance(0.999)
+    clock.wait(0.999)
     assert due(pacer) == []
-    clock.advance(0.001)
+    clock.wait(0.001)
     assert due(pacer) == [1] and pacer.now() == 101 * SECOND
-    clock.advance(2.5)
+    clock.wait(2.5)
     assert due(pacer) == [2, 3]
-    clock.advance(10)
+    clock.wait(10)
     assert due(pacer) == [4, 5] and pacer.read(0.0) is None
 
 
@@ -63,18 +50,18 @@ def test_events_come_when_playback_reaches_them():
 def test_speed(speed, seconds):
     pacer, clock = player(speed=speed)
     due(pacer)
-    clock.advance(seconds)
+    clock.wait(seconds)
     assert due(pacer) == [1, 2] and pacer.now() == 102 * SECOND
 
 
 def test_a_change_of_speed_holds_from_then_on():
     pacer, clock = player()
     due(pacer)
-    clock.advance(1.5)
+    clock.wait(1.5)
     assert due(pacer) == [1]
     pacer.set_speed(3.0)
     assert pacer.now() == round(101.5 * SECOND)
-    clock.advance(0.5)
+    clock.wait(0.5)
     assert due(pacer) == [2, 3] and pacer.now() == 103 * SECOND
 
 
@@ -82,10 +69,10 @@ def test_the_present_does_not_run_ahead_of_what_was_read():
     """A night at a thousand million times: a tick years ahead would make all that follows stale."""
     pacer, clock = player(speed=1e9)
     due(pacer)
-    clock.advance(0.5)
+    clock.wait(0.5)
     assert pacer.now() == 101 * SECOND
     assert pacer.read(0.0).value[:, 0].tolist() == [1]
-    clock.advance(0.5)
+    clock.wait(0.5)
     # The next batch is not read yet, so nothing is known after the last.
     assert pacer.now() == 101 * SECOND
 
@@ -102,7 +89,7 @@ def test_as_fast_as_possible_is_everything_in_breaths():
 def test_a_playhead_beyond_all_times_releases_everything(speed, seconds):
     pacer, clock = player(speed=speed)
     pacer.read(0.0)
-    clock.advance(seconds)
+    clock.wait(seconds)
     assert due(pacer) == [1, 2, 3, 4, 5]
     pacer.pause()
     pacer.seek(100 * SECOND)
@@ -112,13 +99,13 @@ def test_a_playhead_beyond_all_times_releases_everything(speed, seconds):
 def test_pause_and_resume():
     pacer, clock = player()
     due(pacer)
-    clock.advance(0.5)
+    clock.wait(0.5)
     pacer.pause()
-    clock.advance(100)
+    clock.wait(100)
     assert pacer.paused and due(pacer) == [] and pacer.now() == round(100.5 * SECOND)
     pacer.resume()
     assert due(pacer) == []
-    clock.advance(0.5)
+    clock.wait(0.5)
     assert due(pacer) == [1]
 
 
@@ -132,7 +119,7 @@ def test_a_step_releases_the_next_timestamp_whole():
     pacer.step()
     assert due(pacer) == [5] and pacer.now() == 102 * SECOND
     pacer.resume()
-    clock.advance(1.0)
+    clock.wait(1.0)
     assert due(pacer) == [6]
 
 
@@ -144,7 +131,7 @@ def test_a_seek_ahead_releases_what_lies_between_at_once(paused):
         pacer.pause()
     pacer.seek(103 * SECOND)
     assert due(pacer) == [1, 2, 3] and pacer.now() == 103 * SECOND and pacer.restarts == 0
-    clock.advance(1.0)
+    clock.wait(1.0)
     assert due(pacer) == ([] if paused else [4])
 
 
@@ -152,22 +139,22 @@ def test_a_seek_ahead_releases_what_lies_between_at_once(paused):
 def test_a_seek_back_begins_again(ended):
     pacer, clock = player()
     due(pacer)
-    clock.advance(50 if ended else 4)
+    clock.wait(50 if ended else 4)
     assert due(pacer) == ([1, 2, 3, 4, 5] if ended else [1, 2, 3, 4])
     pacer.seek(102 * SECOND)
     assert due(pacer) == [0, 1, 2] and pacer.restarts == 1 and pacer.now() == 102 * SECOND
-    clock.advance(1.0)
+    clock.wait(1.0)
     assert due(pacer) == [3]
 
 
 def test_a_late_reading_comes_with_the_one_before_it():
     pacer, clock = player(times=(0, 3, 1, 4), batch=4)
     due(pacer)
-    clock.advance(2.0)
+    clock.wait(2.0)
     assert due(pacer) == []
-    clock.advance(1.0)
+    clock.wait(1.0)
     assert due(pacer) == [1, 2]
-    clock.advance(1.0)
+    clock.wait(1.0)
     assert due(pacer) == [3]
 
 
@@ -190,7 +177,7 @@ def test_whatever_is_pressed_each_event_comes_once_and_in_order(seed):
         elif press == 4:
             pacer.seek(100 * SECOND + round(rng.uniform(0, 10) * SECOND))
         else:
-            clock.advance(rng.uniform(0, 0.5))
+            clock.wait(rng.uniform(0, 0.5))
         batch = pacer.read(0.0)
         if pacer.restarts != restarts:
             got, restarts = [], pacer.restarts

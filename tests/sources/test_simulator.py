@@ -8,7 +8,7 @@ from estimators.log import INPUT, READING, TICK, TRUTH, truth_of
 from estimators.model.state_space import Input, Jump, Noise, Parameter, Row, Sensor, State, StateSpaceModel
 from estimators.models import MODELS
 from sources.simulator import SensorPlan, Simulator, constant_input, factor, sine_input, stepped_input, summed_inputs
-from tests.models import first_state
+from tests.models import first_state, second_state
 from tests.sources.can.can_tools import same
 from tests.support import read_all
 
@@ -64,10 +64,6 @@ def both(x, u, p, out):
     out[1] = x[1]
 
 
-def one(x, u, p, out):
-    out[0] = x[1]
-
-
 def model(**more):
     given = {
         "name": "two",
@@ -78,7 +74,7 @@ def model(**more):
         "parameters": (Parameter("gain", "", 2.0),),
         "sensors": (
             Sensor("both", (Row("x", "", 1.0), Row("y", "", 1.0)), both),
-            Sensor("one", (Row("one", "", 1.0),), one),
+            Sensor("one", (Row("one", "", 1.0),), second_state),
         ),
         "f": f,
         **more,
@@ -148,7 +144,7 @@ def test_many_true_states_are_blocks():
     many = model(
         states=tuple(State(name, "", float(j), 1.0) for j, name in enumerate(names)),
         noises=(Noise("s0", "", 0.0),),
-        sensors=(Sensor("one", (Row("one", "", 1.0),), one),),
+        sensors=(Sensor("one", (Row("one", "", 1.0),), second_state),),
         f=grow,
     )
     assert many.width == 32
@@ -248,7 +244,7 @@ def test_a_true_angle_stays_within_a_turn():
         out[1] = x[1]
 
     states = (State("a", "rad", 1.0, 1.0, circular=True), State("b", "", 1.0, 1.0))
-    compass = model(f=turn, states=states, sensors=(Sensor("one", (Row("one", "", 1.0),), one),))
+    compass = model(f=turn, states=states, sensors=(Sensor("one", (Row("one", "", 1.0),), second_state),))
     x = true_states(Simulator(compass, seed=0, step=1.0, duration=50.0))[:, 0]
     assert np.all((x >= -np.pi) & (x < np.pi))
     np.testing.assert_allclose(np.exp(1j * x), np.exp(1j * (1.0 + 2.0 * np.arange(1, 51))), atol=1e-13)

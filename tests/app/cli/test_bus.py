@@ -10,21 +10,7 @@ from app.cli.arguments import BusCommand
 from app.twin.sources.asset import make_asset
 from app.twin.twin import load_twin
 from estimators.log import INPUT, READING, TRUTH, truth_of
-from tests.support import read_all
-
-
-class Clock:
-    """Nanoseconds that jump to whatever is waited for, so that an hour is played at once."""
-
-    def __init__(self):
-        self.now = 0
-
-    def __call__(self):
-        return self.now
-
-    def wait(self, seconds):
-        self.now += round(seconds * 1e9)
-        return False
+from tests.support import Clock, read_all
 
 
 def play_at_once(player, duration):

@@ -23,7 +23,7 @@ from estimators.fold import Fold, fold
 from estimators.log import READING, Events, Log
 from estimators.track import DEGRADED, DIVERGED, FAILED, STALE, USABLE, USED
 from estimators.tuning import Tuning
-from tests.app.scripted import MODEL, Replayed, Scripted, Stepped, pull_all, readings, row_count, twin
+from tests.app.scripted import MODEL, Replayed, Scripted, Stepped, pull_all, readings, row_count, solved_by, twin
 from tests.support import SECOND, as_log, assert_same
 from tests.waiting import wait_for
 
@@ -437,23 +437,15 @@ class Solver:
     def __init__(self):
         self.away = False
 
-    def f(self, X, u, p, dt):
+    def called(self, dt):
         if self.away:
             raise RuntimeError("the solver is away")
-        return X @ np.array([[1.0, dt], [0.0, 1.0]]).T
-
-    def h(self, X, u, p):
-        return X[:, :1]
-
-    def model(self):
-        sensors = tuple(replace(sensor, h=self.h, H=None) for sensor in MODEL.sensors)
-        return replace(MODEL, f=self.f, F=None, linear=False, sensors=sensors, black_box=True)
 
 
 def test_a_black_box_that_fails_loses_nothing_and_is_reported_once():
     """15 measurements of which the solver misses 5: those have failed, the others are as if they had not come."""
     solver = Solver()
-    box = solver.model()
+    box = solved_by(solver.called)
     stepped = Stepped(model=box, estimator="filterpy-ukf")
     times, values = series(15)
     for k in range(15):
@@ -478,7 +470,7 @@ def test_a_black_box_that_fails_loses_nothing_and_is_reported_once():
 
 def test_a_refold_over_a_black_box_that_fails_is_reported_too():
     solver = Solver()
-    stepped = Stepped(model=solver.model(), estimator="filterpy-ukf")
+    stepped = Stepped(model=solved_by(solver.called), estimator="filterpy-ukf")
     stepped.put(readings(*series(5)))
     solver.away = True
     stepped.submit(commands.SetTuning("Q.rate", 0.5))
@@ -491,7 +483,7 @@ def test_a_refold_over_a_black_box_that_fails_is_reported_too():
 def test_the_same_failure_is_said_once_however_long_it_lasts():
     """A minute passes between two readings, so that nothing is left out for coming too fast."""
     solver = Solver()
-    model = solver.model()
+    model = solved_by(solver.called)
     log = Log(model.width)
     growing = Fold("filterpy-ukf", model, Tuning.of(model), log)
     notices = Notices(lambda: 0, clock=itertools.count(0, 60).__next__)

@@ -21,14 +21,8 @@ from app.live.jobs import (
 )
 from app.live.notices import Notices
 from estimators.errors import ConfigError
+from tests.support import Clock
 from tests.waiting import LIMIT_S, wait_for
-
-
-class Clock:
-    now = 0.0
-
-    def __call__(self):
-        return self.now
 
 
 @pytest.fixture

@@ -28,6 +28,7 @@ from estimators.models import MODELS
 from estimators.track import DIVERGED
 from estimators.tuning import Tuning
 from tests.app.scripted import Scripted, Stepped, events, fresh_status, readings, twin, viewed
+from tests.models import first_states
 from tests.support import SECOND
 
 RESET_AT, END = 20, 24
@@ -41,16 +42,11 @@ def f(x, u, p, dt, out):
             out[k] = np.nan
 
 
-def fix(x, u, p, out):
-    out[0] = x[0]
-    out[1] = x[1]
-
-
 RAIL = StateSpaceModel(
     name="rail", title="Rail", f=f,
     states=(State("east", "m", 0, 5), State("north", "m", 0, 1), State("height", "m", 0, 1)),
     noises=(Noise("east", "m²/s", 1.0), Noise("north", "m²/s", 0.1), Noise("height", "m²/s", 0.1)),
-    sensors=(Sensor("gnss", (Row("east", "m", 0.25), Row("north", "m", 0.25)), fix),),
+    sensors=(Sensor("gnss", (Row("east", "m", 0.25), Row("north", "m", 0.25)), first_states),),
 )  # fmt: skip
 
 

@@ -5,7 +5,6 @@ The model's solver is let on by the test, step by step, so that the fold stands 
 
 import json
 import threading
-from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -15,7 +14,7 @@ import app.live.watchdog
 from app.live.commands import SetTuning
 from app.live.engine import Engine
 from app.web.server import PageServer
-from tests.app.scripted import MODEL, Scripted, readings, row_count, twin
+from tests.app.scripted import Scripted, readings, row_count, solved_by, twin
 from tests.app.served import SECRET, Client
 from tests.support import SECOND
 from tests.waiting import LIMIT_S, wait_for
@@ -31,14 +30,10 @@ class Solver:
         self.held = ""
         """The thread that it holds up."""
 
-    def f(self, X, u, p, dt):
+    def called(self, dt):
         if dt > 0.0 and threading.current_thread().name == self.held:
             self.at_work.set()
             self.left.acquire()
-        return X @ np.array([[1.0, dt], [0.0, 1.0]]).T
-
-    def h(self, X, u, p):
-        return X[:, :1]
 
     def hold(self, thread):
         self.at_work.clear()
@@ -47,10 +42,6 @@ class Solver:
     def let_go(self):
         self.held = ""
         self.left.release(1000)
-
-    def model(self):
-        sensors = tuple(replace(sensor, h=self.h, H=None) for sensor in MODEL.sensors)
-        return replace(MODEL, f=self.f, F=None, linear=False, sensors=sensors, black_box=True)
 
 
 @pytest.fixture
@@ -61,7 +52,7 @@ def running(monkeypatch, tmp_path):
     # Nobody gives the solver up.
     monkeypatch.setattr(app.live.watchdog, "CHECK_AFTER_S", float("inf"))
     solver, source = Solver(), Scripted()
-    engine = Engine(twin(model=solver.model(), estimator="filterpy-ukf"), lambda report: source)
+    engine = Engine(twin(model=solved_by(solver.called), estimator="filterpy-ukf"), lambda report: source)
     server = PageServer(engine, port=0, viser_port=None, secret=SECRET)
     server.start()
     engine.start()

@@ -5,6 +5,7 @@ from dataclasses import replace
 import numpy as np
 
 from estimators.model.state_space import Input, Noise, Parameter, Row, Sensor, State, StateSpaceModel
+from tests.models import second_state
 
 
 def f(x, u, p, dt, out):
@@ -15,10 +16,6 @@ def f(x, u, p, dt, out):
 def both(x, u, p, out):
     out[0] = x[0] * x[0] + x[1]
     out[1] = x[1] - u[0]
-
-
-def speed(x, u, p, out):
-    out[0] = x[1]
 
 
 def f_block(X, u, p, dt):
@@ -43,7 +40,7 @@ ONE = StateSpaceModel(
     noises=(Noise("x", "m²/s", 0.01), Noise("v", "m²/s³", 0.03)),
     sensors=(
         Sensor("both", (Row("a", "1", 0.05), Row("b", "m/s", 0.2)), h=both),
-        Sensor("speed", (Row("speed", "m/s", 0.1),), h=speed),
+        Sensor("speed", (Row("speed", "m/s", 0.1),), h=second_state),
     ),
     f=f,
     max_step=0.15,

@@ -22,10 +22,11 @@ from estimators.fit.objective import SHARES, Cancelled, FitProgress, Objective, 
 from estimators.fit.recording import Recording, held_out_rows, without_queries
 from estimators.fold import Fold
 from estimators.log import READING, Log
-from estimators.model.state_space import Noise, Parameter, Row, Sensor, State, StateSpaceModel
+from estimators.model.state_space import Parameter
 from estimators.track import Track
 from estimators.tuning import Tuning
 from tests.benchmarks.recovery import CASES, recover
+from tests.models import level_model
 from tests.support import folded
 
 DECADES = 2.0 * np.log(10.0)
@@ -40,19 +41,10 @@ def level(x, u, p, out):
     out[0] = x[0] + p[1]
 
 
-MODEL = StateSpaceModel(
-    name="walk",
-    title="a walk that returns",
-    states=(State("level", "m", 0.0, 2.0),),
+MODEL = level_model(
+    {"float": 1.0, "silent": 1.0}, 0.5, name="walk", std=2.0, h=level, f=walk, linear=True,
     parameters=(Parameter("rate", "1/s", 0.1, 0.0, 1.0), Parameter("offset", "m", 0.0, -5.0, 5.0)),
-    noises=(Noise("level", "m²/s", 0.5),),
-    sensors=(
-        Sensor("float", (Row("float", "m", 1.0),), h=level),
-        Sensor("silent", (Row("silent", "m", 1.0),), h=level),
-    ),
-    f=walk,
-    linear=True,
-)
+)  # fmt: skip
 
 
 def simulated(seed: int, n: int, q: float = 0.2, r: float = 0.5, rate: float = 0.1) -> np.ndarray:

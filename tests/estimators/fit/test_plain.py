@@ -12,15 +12,10 @@ from estimators.fit.recording import Recording
 from estimators.log import Log
 from estimators.model.state_space import Noise, Row, Sensor, State, StateSpaceModel
 from estimators.tuning import Tuning
-from tests.models import first_state, level_model
+from tests.models import constant_speed, first_state, level_model
 
 DIFFUSE = 1e7
 """Variance of the first state, as in Durbin & Koopman, Time Series Analysis by State Space Methods (2012), 2.2.5."""
-
-
-def trend_step(x, u, p, dt, out):
-    out[0] = x[0] + dt * x[1]
-    out[1] = x[1]
 
 
 TREND = StateSpaceModel(
@@ -29,7 +24,7 @@ TREND = StateSpaceModel(
     states=(State("level", "", 0.0, DIFFUSE**0.5), State("slope", "", 0.0, DIFFUSE**0.5)),
     noises=(Noise("level", "1/s", 1.0), Noise("slope", "1/s³", 0.1)),
     sensors=(Sensor("y", (Row("y", "", 1.0),), h=first_state),),
-    f=trend_step,
+    f=constant_speed,
     linear=True,
 )
 NILE = level_model({"y": 10_000.0}, 3000.0, mean=0.0, std=DIFFUSE**0.5, linear=True)

@@ -11,6 +11,7 @@ from estimators.fit.uncertainty import MAX_CORRELATION, curvature
 from estimators.log import Log
 from estimators.model.state_space import Noise, Row, Sensor, State, StateSpaceModel
 from estimators.tuning import Tuning
+from tests.models import first_state, second_state
 
 DECADES = 2.0 * np.log(10.0)  # Deviation of the weak prior of a variance
 NAMES = ("a", "b", "c")
@@ -23,14 +24,6 @@ def step(x, u, p, dt, out):
         out[i] = x[i]
 
 
-def first(x, u, p, out):
-    out[0] = x[0]
-
-
-def second(x, u, p, out):
-    out[0] = x[1]
-
-
 def third(x, u, p, out):
     out[0] = x[2]
 
@@ -41,7 +34,8 @@ WALKS = StateSpaceModel(
     states=tuple(State(name, "", 0.0, 2.0) for name in NAMES),
     noises=tuple(Noise(name, "1/s", 0.1) for name in NAMES),
     sensors=tuple(
-        Sensor(name, (Row(name, "", 1.0),), h=h) for name, h in zip(NAMES, (first, second, third), strict=True)
+        Sensor(name, (Row(name, "", 1.0),), h=h)
+        for name, h in zip(NAMES, (first_state, second_state, third), strict=True)
     ),
     f=step,
     linear=True,

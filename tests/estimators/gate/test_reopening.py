@@ -13,6 +13,7 @@ from estimators.log import MAINTENANCE, READING, RESET, Events, Log
 from estimators.model.state_space import Noise, Row, Sensor, State, StateSpaceModel
 from estimators.track import GATED, USED
 from estimators.tuning import Tuning
+from tests.models import first_state, unchanged
 from tests.support import SECOND, arrive, as_log, assert_same
 from tests.support import folded as advanced
 
@@ -207,20 +208,12 @@ def test_what_could_have_been_confirmed_and_was_not_stays_rejected():
     assert decided(ReopeningEvidence(2.0, 3, 0.0, 50.0), False, True) == "believed"
 
 
-def _along(x, u, p, dt, out):
-    out[:] = x
-
-
 def _from_west(x, u, p, out):
     out[0] = x[0] + 10.0
 
 
 def _from_east(x, u, p, out):
     out[0] = 30.0 - x[0]
-
-
-def _itself(x, u, p, out):
-    out[0] = x[0]
 
 
 LANDMARKS = StateSpaceModel(
@@ -230,9 +223,9 @@ LANDMARKS = StateSpaceModel(
     noises=(Noise("x", "m²/s", 1e-4),),
     sensors=tuple(
         Sensor(name, (Row(name, "m", 0.01),), h=h)
-        for name, h in (("west", _from_west), ("east", _from_east), ("fix", _itself))
+        for name, h in (("west", _from_west), ("east", _from_east), ("fix", first_state))
     ),
-    f=_along,
+    f=unchanged,
     linear=True,
 )
 

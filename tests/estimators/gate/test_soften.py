@@ -9,6 +9,7 @@ from estimators.log import READING, Log
 from estimators.model.state_space import Noise, Row, Sensor, State, StateSpaceModel
 from estimators.track import GATED, USED
 from estimators.tuning import Tuning
+from tests.models import unchanged
 from tests.support import assert_same, folded, log_of
 
 from .two_sensors import MODEL, TUNING
@@ -61,11 +62,6 @@ def test_hard_refuses_what_soft_takes():
     assert one_reading("kf", TUNING).track.verdict[0] == GATED
 
 
-def _stay(x, u, p, dt, out):
-    out[0] = x[0]
-    out[1] = x[1]
-
-
 def _both(x, u, p, out):
     out[0] = x[0]
     out[1] = x[0] + x[1]
@@ -80,7 +76,7 @@ PLANE = StateSpaceModel(
     sensors=(
         Sensor("s", (Row("s1", "m", variance=0.04), Row("s2", "m", variance=0.5)), h=_both, correlation=CORRELATION),
     ),
-    f=_stay,
+    f=unchanged,
     max_step=1.0,
     linear=True,
     source="none",

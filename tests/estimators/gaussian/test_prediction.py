@@ -11,7 +11,7 @@ from estimators.models import MODELS
 from estimators.registry import ESTIMATORS
 from estimators.track import MISSING, USED
 from estimators.tuning import Tuning
-from tests.models import first_state, unchanged
+from tests.models import constant_speed, first_state, unchanged
 from tests.support import SECOND, folded, log_of
 
 # The gain of the first readings of kf-steady is another.
@@ -21,11 +21,6 @@ NAMES = [name for name, entry in ESTIMATORS.items() if entry.family == "Gaussian
 def growth(x, u, p, dt, out):
     """Euler's step of x' = x."""
     out[0] = x[0] + dt * x[0]
-
-
-def drift(x, u, p, dt, out):
-    out[0] = x[0] + dt * x[1]
-    out[1] = x[1]
 
 
 def bearing(x, u, p, out):
@@ -103,7 +98,7 @@ def test_heading_takes_the_short_way_over_pi(estimator):
 @pytest.mark.parametrize("estimator", NAMES)
 def test_turning_for_many_rounds(estimator):
     """A heading that turns 1 rad/s for a minute: wrapped all the way, the rate found, the error never a round."""
-    turning = model(drift, states=2, mean=0.0, std=1.0, q=1e-6, r=1e-4, circular=("x0", "y"))
+    turning = model(constant_speed, states=2, mean=0.0, std=1.0, q=1e-6, r=1e-4, circular=("x0", "y"))
     wrapped = lambda a: (a + np.pi) % (2 * np.pi) - np.pi  # noqa: E731
     found = run(estimator, turning, *[(0.2 * k, READING, wrapped(0.2 * k)) for k in range(300)])
     heading, rate = found.track.mean.T
@@ -163,9 +158,9 @@ def test_a_reset_recovers_from_an_estimate_that_was_lost(estimator):
     """Events of 1e300 are believed, as Q is 1e300; after a reset nothing of that may remain."""
     events = [(0, TICK, 0.0), (0.5, READING, 1e300), (0.7, READING, -1e300), (0.9, READING, 1e300)]
     after = [(1, RESET, 0.0), (1.2, READING, 0.3), (1.4, READING, 0.4)]
-    lost = run(estimator, model(drift, states=2, q=1e300), *events, *after).track
+    lost = run(estimator, model(constant_speed, states=2, q=1e300), *events, *after).track
     assert np.abs(lost.mean[:4]).max() > 1e200
-    fresh = run(estimator, model(drift, states=2, q=1e300), (1, TICK, 0.0), *after[1:]).track
+    fresh = run(estimator, model(constant_speed, states=2, q=1e300), (1, TICK, 0.0), *after[1:]).track
     np.testing.assert_array_equal(lost.mean[-3:], fresh.mean)
 
 

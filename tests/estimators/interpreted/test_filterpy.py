@@ -11,6 +11,7 @@ from estimators.model.state_space import Input, Noise, Parameter, Row, Sensor, S
 from estimators.track import FAILED, GATED, HELD_OUT, MISSING, USED
 from estimators.tuning import Tuning
 from tests.estimators.test_fold import MODEL, everything
+from tests.models import constant_speed
 from tests.support import SECOND, as_log, assert_same, folded, log_of
 
 PAIRS = np.array([[0, 1], [0, 2], [1, 2]])
@@ -74,11 +75,6 @@ def log():
     return as_log(Events.concat(batch, 2))
 
 
-def turn(x, u, p, dt, out):
-    out[0] = x[0] + dt * x[1]
-    out[1] = x[1]
-
-
 def heading(x, u, p, out):
     out[0] = x[0] + 0.05 * x[1] * x[1]
     out[1] = x[1]
@@ -90,7 +86,7 @@ COMPASS = StateSpaceModel(
     states=(State("angle", "rad", 3.0, 0.3, circular=True), State("rate", "rad/s", 0.8, 0.3)),
     noises=(Noise("angle", "rad²/s", 0.01), Noise("rate", "rad²/s³", 0.02)),
     sensors=(Sensor("compass", (Row("heading", "rad", 0.02, circular=True), Row("rate", "rad/s", 0.1)), h=heading),),
-    f=turn,
+    f=constant_speed,
 )
 
 

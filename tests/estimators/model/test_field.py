@@ -13,6 +13,7 @@ from estimators.models.thermal_field import thermal_field
 from estimators.numerics.smoothed_noise import smooth
 from estimators.tuning import Tuning
 from sources.simulator import Simulator
+from tests.models import first_state, unchanged
 from tests.support import as_log, folded, log_of, read_all
 
 
@@ -115,16 +116,10 @@ def test_forecast_noise_has_the_models_shape():
 
 
 def test_what_a_large_field_cannot_have_is_refused():
-    def stay(x, u, p, dt, out):
-        out[:] = x
-
-    def first(x, u, p, out):
-        out[0] = x[0]
-
     def Q(x, u, p, q, dt, out):
         out[:] = 0
 
-    common = dict(title="", sensors=(Sensor("s", (Row("s", "K", 1.0),), h=first),), f=stay)
+    common = dict(title="", sensors=(Sensor("s", (Row("s", "K", 1.0),), h=first_state),), f=unchanged)
     field = Field("t", "K", (50, 50))
     with pytest.raises(ModelError, match="Q of 2,500 states would be a matrix of 0.05 GB"):
         StateSpaceModel(name="m", states=field, noises=(Noise("t", "K²/s", 1.0),), Q=Q, **common)

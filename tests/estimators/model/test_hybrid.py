@@ -17,7 +17,7 @@ from estimators.model.correction import GaussianProcess, Net, Ridge
 from estimators.model.hybrid import LearnedCorrection, hybrid
 from estimators.model.state_space import Input, Noise, Parameter, Row, Sensor, State, StateSpaceModel
 from estimators.tuning import Tuning
-from tests.models import complex_step
+from tests.models import complex_step, second_state
 
 RNG = np.random.default_rng(3)
 POINTS = RNG.normal((60.0, 10.0, -2.0), (10.0, 3.0, 0.5), (24, 3))
@@ -44,10 +44,6 @@ def F(x, u, p, dt, out):
     out[1, 1] = 1.0 - dt * 0.03
 
 
-def h(x, u, p, out):
-    out[0] = x[1]
-
-
 PHYSICS = StateSpaceModel(
     name="vessel",
     title="A body in a shell",
@@ -55,7 +51,7 @@ PHYSICS = StateSpaceModel(
     inputs=(Input("load", "W", default=-2.0),),
     parameters=(Parameter("loss", "1/s", 0.05, 0.01, 0.5),),
     noises=(Noise("body", "°C²/s", 0.02), Noise("shell", "°C²/s", 0.01)),
-    sensors=(Sensor("gauge", (Row("gauge", "°C", 0.04),), h=h),),
+    sensors=(Sensor("gauge", (Row("gauge", "°C", 0.04),), h=second_state),),
     f=f,
     F=F,
     linear=True,

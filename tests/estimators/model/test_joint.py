@@ -13,6 +13,7 @@ from estimators.model.assemble import JointParameter, joint
 from estimators.model.state_space import Noise, Parameter, Row, Sensor, State, StateSpaceModel
 from estimators.models import MODELS
 from estimators.tuning import Tuning
+from tests.models import level_model
 from tests.support import SECOND
 
 
@@ -37,19 +38,14 @@ def shifted(x, u, p, out):
     out[0] = x[0] + p[1]
 
 
-TANK = StateSpaceModel(
-    name="tank",
-    title="Tank with a leak and an inflow",
-    states=(State("level", "m", mean=1.0, std=0.5),),
+TANK = level_model(
+    {"level": 0.04}, 0.01, name="tank", title="Tank with a leak and an inflow", mean=1.0, std=0.5, h=level, f=fall,
     parameters=(
         Parameter("leak", "1/s", 0.1, 0.0, 1.0),
         Parameter("inflow", "m/s", 0.3, -2.0, 2.0),
         Parameter("offset", "m", 0.25, -1.0, 1.0),
     ),
-    noises=(Noise("level", "m²/s", 0.01),),
-    sensors=(Sensor("level", (Row("level", "m", 0.04),), h=level),),
-    f=fall,
-)
+)  # fmt: skip
 BY_HAND = StateSpaceModel(
     name="tank_by_hand",
     title="The same, its inflow a state",

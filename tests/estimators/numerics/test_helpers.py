@@ -13,10 +13,11 @@ from estimators.errors import ModelError
 from estimators.fold import fold
 from estimators.log import READING
 from estimators.model.assemble import JointParameter, joint
-from estimators.model.state_space import Noise, Parameter, Row, Sensor, State, StateSpaceModel
+from estimators.model.state_space import Parameter
 from estimators.numerics.helpers import with_helpers
 from estimators.numerics.jit import jit
 from estimators.tuning import Tuning
+from tests.models import level_model
 from tests.support import log_of
 
 LIMIT = 41.0
@@ -47,11 +48,8 @@ def h_in_one(x, u, p, out):
 
 
 def tank(f=f, h=h):
-    return StateSpaceModel(
-        name="tank", title="", states=(State("level", "m", 40.0, 5.0),), noises=(Noise("level", "m²/s", 0.1),), f=f,
-        parameters=(Parameter("rate", "1/s", 0.1, 0.0, 1.0),),
-        sensors=(Sensor("gauge", (Row("level", "m", 1.0),), h=h),),
-    )  # fmt: skip
+    parameters = (Parameter("rate", "1/s", 0.1, 0.0, 1.0),)
+    return level_model({"gauge": 1.0}, 0.1, mean=40.0, std=5.0, f=f, h=h, parameters=parameters)
 
 
 def log():

@@ -18,7 +18,7 @@ from estimators.smoothing.smooth import KINDS, smooth
 from estimators.track import GATED
 from estimators.tuning import Tuning
 from tests.estimators.linear_models import CORRELATED, JointGaussian, case, close, random_linear, random_log
-from tests.models import first_state
+from tests.models import constant_speed, first_state
 from tests.support import SECOND, as_log, assert_same, folded
 
 GAUSSIAN = [name for name in KINDS if ESTIMATORS[name].family == "Gaussian" and name != "kf-steady"]
@@ -77,11 +77,6 @@ def test_states_that_are_certain_at_first(estimator):
 # readings, steps no longer than the model allows, and the dense solution speak of the same process.
 
 
-def f(x, u, p, dt, out):
-    out[0] = x[0] + dt * x[1]
-    out[1] = x[1]
-
-
 def Q(x, u, p, q, dt, out):
     out[0, 0] = q[0] * dt**3 / 3.0
     out[0, 1] = out[1, 0] = q[0] * dt**2 / 2.0
@@ -95,7 +90,7 @@ BODY = StateSpaceModel(
     states=(State("place", "m", mean=1.0, std=2.0), State("speed", "m/s", mean=-0.5, std=1.0)),
     noises=(Noise("push", "m²/s³", variance=0.3),),
     sensors=(Sensor("place", (Row("place", "m", variance=VARIANCE),), h=first_state),),
-    f=f,
+    f=constant_speed,
     Q=Q,
     linear=True,
     max_step=0.4,

@@ -21,6 +21,7 @@ from estimators.model.state_space import Noise, Row, Sensor, State, StateSpaceMo
 from estimators.smoothing.smooth import consistency
 from estimators.smoothing.walk import Smoothed
 from tests.estimators.smoothing.test_second_opinions import PENDULUM
+from tests.models import first_states
 
 DRAWS = 300
 
@@ -39,11 +40,6 @@ def Q(x, u, p, q, dt, out):
         out[i + 2, i + 2] = q[0] * dt
 
 
-def h(x, u, p, out):
-    out[0] = x[0]
-    out[1] = x[1]
-
-
 MEAN = np.array([0.0, 0.0, 1.0, -1.0])
 CAR = StateSpaceModel(
     name="car",
@@ -53,7 +49,7 @@ CAR = StateSpaceModel(
         for name, unit, mean in zip(("east", "north", "v_east", "v_north"), ("m", "m", "m/s", "m/s"), MEAN, strict=True)
     ),
     noises=(Noise("push", "m²/s³", variance=1.0),),
-    sensors=(Sensor("place", (Row("east", "m", variance=0.25), Row("north", "m", variance=0.25)), h=h),),
+    sensors=(Sensor("place", (Row("east", "m", variance=0.25), Row("north", "m", variance=0.25)), h=first_states),),
     f=f,
     Q=Q,
     linear=True,

@@ -14,21 +14,11 @@ from estimators.log import Events
 from sources.can.bus import LOSS_PERIOD_S, RECONNECT_WAITS_S, CanBus, open_bus
 from sources.can.decoder import Decoder
 from tests.sources.can.can_tools import DBC, Reports, dbc, frame, sensor
-from tests.support import free_port
+from tests.support import Clock, free_port
 from tests.waiting import wait_for
 
 DATA = bytes.fromhex("f4010fa000000080")
 GROUP = "239.74.163.2"
-
-
-class Clock:
-    """Seconds that pass when a test says so."""
-
-    def __init__(self):
-        self.now = 100.0
-
-    def __call__(self):
-        return self.now
 
 
 class FakeBus:
@@ -110,7 +100,7 @@ def test_one_bad_packet_is_counted_and_the_bus_stays(decoder):
 
 
 def test_a_bus_that_fails_is_opened_again_with_longer_and_longer_waits(decoder):
-    reports, clock = Reports(), Clock()
+    reports, clock = Reports(), Clock(100.0)
     gone = [OSError("network is down"), OSError("network is down")]
     first, last = FakeBus([frame(256, DATA), *gone]), FakeBus([frame(256, DATA)])
     answers = [first, SourceError("no"), SourceError("no"), last]
@@ -175,7 +165,7 @@ def test_multicast_stays_on_this_machine_and_arrives(decoder, multicast):
 
 @pytest.mark.skipif(sys.platform != "linux", reason="a socket option of Linux")
 def test_frames_that_the_socket_drops_are_counted_and_named(decoder, multicast):
-    clock, reports, sent = Clock(), Reports(), 3000
+    clock, reports, sent = Clock(100.0), Reports(), 3000
     listener, sender = multicast(GROUP), multicast(GROUP)
     with socket.socket(fileno=os.dup(listener.fileno())) as sock:
         sock.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, 4096)
@@ -214,7 +204,7 @@ def test_two_groups_on_one_host_are_two_buses(multicast, groups):
 
 def test_a_message_that_never_comes_is_named_once(tmp_path):
     """After some seconds in which others came, or after three of its periods if the DBC tells them."""
-    clock, reports = Clock(), Reports()
+    clock, reports = Clock(100.0), Reports()
     text = DBC + 'BA_DEF_ BO_ "GenMsgCycleTime" INT 0 65535;\nBA_DEF_DEF_ "GenMsgCycleTime" 0;\n'
     slow = dbc(tmp_path, text + 'BA_ "GenMsgCycleTime" BO_ 258 10000;\n')
     channels = [sensor(0, "ENGINE", "Temp"), sensor(1, "WIDE", "Ratio"), sensor(2, "FIX", "Lat")]

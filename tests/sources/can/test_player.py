@@ -14,9 +14,9 @@ from sources.can.decoder import Decoder
 from sources.can.player import Encoder, Player
 from sources.simulator import SensorPlan, Simulator, stepped_input
 from sources.source import Channel
-from tests.models import first_state
+from tests.models import first_state, second_state
 from tests.sources.can.can_tools import Reports, dbc
-from tests.support import read_all
+from tests.support import Clock, read_all
 from tests.waiting import wait_for
 
 ASSET = """VERSION ""
@@ -39,10 +39,6 @@ def f(x, u, p, dt, out):
     out[1] = x[1]
 
 
-def flow(x, u, p, out):
-    out[0] = x[1]
-
-
 MODEL = StateSpaceModel(
     name="asset",
     title="Asset",
@@ -51,7 +47,7 @@ MODEL = StateSpaceModel(
     inputs=(Input("power", "W", 3.0),),
     sensors=(
         Sensor("temp", (Row("temp", "°C", 0.04),), first_state),
-        Sensor("flow", (Row("flow", "m/s", 0.04),), flow),
+        Sensor("flow", (Row("flow", "m/s", 0.04),), second_state),
     ),
     f=f,
 )
@@ -90,16 +86,6 @@ class Listener:
 
     def shutdown(self):
         pass
-
-
-class Clock:
-    """ns that jump to whatever is waited for."""
-
-    def __init__(self):
-        self.now = 0
-
-    def __call__(self):
-        return self.now
 
 
 def play(tmp_path, clock=None, bus=None, report=lambda key, text: None):

@@ -1,23 +1,14 @@
 """Eight assets of which it is known how they were made, as models; `recordings.py` makes their recordings."""
 
 import math
+from dataclasses import replace
 
 from estimators.model import Field, Input, Noise, Row, Sensor, State, StateSpaceModel
+from tests.models import constant_speed, first_state, first_state_squared, level_model, unchanged
 
 CELLS = 1200
 EVERY = 40
 """Cells from one probe of the field to the next."""
-
-
-def moving(x, u, p, dt, out):
-    """Constant velocity."""
-    out[0] = x[0] + dt * x[1]
-    out[1] = x[1]
-
-
-def first(x, u, p, out):
-    """The first state."""
-    out[0] = x[0]
 
 
 LINEAR = StateSpaceModel(
@@ -25,8 +16,8 @@ LINEAR = StateSpaceModel(
     title="A cart on a rail",
     states=(State("place", "m", std=5.0), State("speed", "m/s", std=1.0)),
     noises=(Noise("place", "m²/s", 0.001), Noise("speed", "m²/s³", 0.01)),
-    sensors=(Sensor("rail", (Row("rail", "m", 1.0),), h=first),),
-    f=moving,
+    sensors=(Sensor("rail", (Row("rail", "m", 1.0),), h=first_state),),
+    f=constant_speed,
     linear=True,
 )
 
@@ -42,7 +33,7 @@ MILD = StateSpaceModel(
     states=(State("level", "m", mean=1.0, std=0.05),),
     inputs=(Input("inflow", "m/s", 0.1),),
     noises=(Noise("level", "m²/s", 1e-5),),
-    sensors=(Sensor("gauge", (Row("gauge", "m", 1e-4),), h=first),),
+    sensors=(Sensor("gauge", (Row("gauge", "m", 1e-4),), h=first_state),),
     f=draining,
 )
 
@@ -67,25 +58,7 @@ STRONG = StateSpaceModel(
 )
 
 
-def staying(x, u, p, dt, out):
-    """A random walk."""
-    out[0] = x[0]
-
-
-STILL = StateSpaceModel(
-    name="still",
-    title="A level that hardly changes",
-    states=(State("level", "m", std=3.0),),
-    noises=(Noise("level", "m²/s", 1e-6),),
-    sensors=(Sensor("float", (Row("float", "m", 1.0),), h=first),),
-    f=staying,
-    linear=True,
-)
-
-
-def squared(x, u, p, out):
-    """A sensor that knows no sign."""
-    out[0] = x[0] * x[0]
+STILL = level_model({"float": 1.0}, 1e-6, name="still", title="A level that hardly changes", std=3.0, linear=True)
 
 
 PEAKS = StateSpaceModel(
@@ -93,8 +66,8 @@ PEAKS = StateSpaceModel(
     title="A sensor that cannot tell left from right",
     states=(State("x", "m", std=4.0),),
     noises=(Noise("x", "m²/s", 0.01),),
-    sensors=(Sensor("distance", (Row("distance", "m²", 4.0),), h=squared),),
-    f=staying,
+    sensors=(Sensor("distance", (Row("distance", "m²", 4.0),), h=first_state_squared),),
+    f=unchanged,
 )
 
 
@@ -147,14 +120,13 @@ def with_load(x, u, p, dt, out):
     out[2] = x[2]
 
 
-UNSEEN = StateSpaceModel(
+UNSEEN = replace(
+    LINEAR,
     name="unseen",
     title="A cart with a load that nothing tells of",
-    states=(State("place", "m", std=5.0), State("speed", "m/s", std=1.0), State("load", "kg", mean=10.0, std=3.0)),
-    noises=(Noise("place", "m²/s", 0.001), Noise("speed", "m²/s³", 0.01), Noise("load", "kg²/s", 1e-4)),
-    sensors=(Sensor("rail", (Row("rail", "m", 1.0),), h=first),),
+    states=(*LINEAR.states, State("load", "kg", mean=10.0, std=3.0)),
+    noises=(*LINEAR.noises, Noise("load", "kg²/s", 1e-4)),
     f=with_load,
-    linear=True,
 )
 
 
@@ -169,7 +141,7 @@ VARYING = StateSpaceModel(
     states=(State("excess", "K", mean=10.0, std=5.0),),
     inputs=(Input("flow", "1/s", 0.1),),
     noises=(Noise("excess", "K²/s", 0.5),),
-    sensors=(Sensor("probe", (Row("probe", "K", 0.25),), h=first),),
+    sensors=(Sensor("probe", (Row("probe", "K", 0.25),), h=first_state),),
     f=cooled,
     linear=True,
 )

@@ -25,6 +25,7 @@ from estimators.log import READING, TRUTH, Events
 from estimators.models import MODELS
 from estimators.numerics.peaks import Peak
 from tests.app.scripted import events, viewed
+from tests.models import first_states
 from tests.waiting import LIMIT_S, wait_for
 
 WINDING = MODELS["motor_winding"]
@@ -259,17 +260,13 @@ def test_vehicle_scene_keeps_the_vehicle_in_the_middle():
         out[1] = x[1]
         out[2] = x[2]
 
-    def fix(x, u, p, out):
-        out[0] = x[0]
-        out[1] = x[1]
-
     from estimators.model.state_space import Noise, Row, Sensor, State, StateSpaceModel
 
     model = StateSpaceModel(
         name="sled", title="Sled", f=f, linear=True,
         states=(State("east", "m", 0, 10), State("north", "m", 0, 10), State("speed", "m/s", 0, 5)),
         noises=(Noise("speed", "(m/s)²/s", 0.1),),
-        sensors=(Sensor("gnss", (Row("east", "m", 1.0), Row("north", "m", 1.0)), fix),),
+        sensors=(Sensor("gnss", (Row("east", "m", 1.0), Row("north", "m", 1.0)), first_states),),
     )  # fmt: skip
     engine = viewed(model, view=ViewSection(scene=SceneSection(kind="vehicle", position=("east", "north"))))
     t = np.arange(1.0, 61.0)

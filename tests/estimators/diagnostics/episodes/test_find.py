@@ -16,7 +16,7 @@ from estimators.log import READING, RESET, Events, Log
 from estimators.model.state_space import Input, Noise, State
 from estimators.track import DIVERGED, GATED, TRACKING, USED, WAITING
 from estimators.tuning import Tuning
-from tests.models import level_model
+from tests.models import level_model, unchanged
 from tests.support import SECOND, as_log
 from tests.support import folded as advanced
 
@@ -447,14 +447,10 @@ def test_the_onset_of_an_episode_is_not_before_the_reset_nor_in_the_episode_befo
 )
 def test_states_that_one_sensor_alone_observes_are_listed(states, said):
     model = level_model(
-        {"total": 1.0}, 1.0, h=total, states=tuple(State(name, "1") for name in states), f=kept,
+        {"total": 1.0}, 1.0, h=total, states=tuple(State(name, "1") for name in states), f=unchanged,
         noises=(Noise(states[0], "1/s", 1.0),),
     )  # fmt: skip
     assert SensorFacts(cause="silent", start=0.0, model=model, s=0).observed_by == said
-
-
-def kept(x, u, p, dt, out):
-    out[:] = x
 
 
 def total(x, u, p, out):

@@ -16,6 +16,13 @@ KEPT = 1.0 - PREDICTED / S
 """1 - K: the share of an error of the prediction that a reading leaves."""
 
 
+def log_of(one: StateSpaceModel, values) -> Log:
+    """A reading of y each second."""
+    log = Log.of(one)
+    log.add("y", np.arange(1.0, len(values) + 1.0), values)
+    return log
+
+
 def drift(x, u, p, dt, out):
     out[0] = x[0] + dt * (u[0] + p[0] + 1.0 / p[1])
 

@@ -8,6 +8,7 @@ from estimators.log import Log
 from estimators.model import Noise, Parameter, Row, Sensor, State, StateSpaceModel
 from estimators.models import MODELS
 from estimators.tuning import Tuning
+from tests.models import first_state
 
 from .models import COUPLED, simulate
 
@@ -92,16 +93,13 @@ def test_a_state_that_forgets_its_prior_needs_no_measurement(rate, observed):
     def f(x, u, p, dt, out):
         out[0], out[1] = x[0], x[1] * np.exp(-p[0] * dt)
 
-    def h(x, u, p, out):
-        out[0] = x[0]
-
     model = StateSpaceModel(
         name=f"decay{rate}",
         title="",
         states=(State("level", "m", 0.0, 2.0), State("error", "m", 0.0, 3.0)),
         parameters=(Parameter("rate", "1/s", rate, 0.0, 1.0),),
         noises=(Noise("level", "m²/s", 0.1), Noise("error", "m²/s", 0.1)),
-        sensors=(Sensor("gauge", (Row("gauge", "m", 1.0),), h=h),),
+        sensors=(Sensor("gauge", (Row("gauge", "m", 1.0),), h=first_state),),
         f=f,
     )
     log = Log.of(model)

@@ -5,21 +5,15 @@ import pytest
 
 from estimators.diagnostics.sensitivity.checklist import linearity
 from estimators.fold import fold
-from estimators.log import Log
 from estimators.model.state_space import StateSpaceModel
 from estimators.tuning import Tuning
+from tests.estimators.diagnostics.sensitivity.models import log_of
 from tests.models import first_state, level_model, many_states
 from tests.models import first_state_squared as square
 
 
 def model(h, std: float) -> StateSpaceModel:
     return level_model({"y": 1.0}, 0.01, state="x", mean=3.0, std=std, h=h)
-
-
-def log_of(one: StateSpaceModel, values) -> Log:
-    log = Log.of(one)
-    log.add("y", np.arange(1.0, len(values) + 1.0), values)
-    return log
 
 
 def test_a_straight_line_passes_without_difference():

@@ -5,9 +5,9 @@ import pytest
 
 from estimators.diagnostics.sensitivity.posterior import FAR_SIGMA, peaks, tails
 from estimators.fold import fold
-from estimators.log import Log
 from estimators.model.state_space import StateSpaceModel
 from estimators.tuning import Tuning
+from tests.estimators.diagnostics.sensitivity.models import log_of
 from tests.models import first_state as level
 from tests.models import first_state_squared as square
 from tests.models import level_model, many_states
@@ -15,12 +15,6 @@ from tests.models import level_model, many_states
 
 def model(h, variance: float = 1.0) -> StateSpaceModel:
     return level_model({"y": variance}, 0.001, state="x", std=3.0, h=h)
-
-
-def log_of(one: StateSpaceModel, values) -> Log:
-    log = Log.of(one)
-    log.add("y", np.arange(1.0, len(values) + 1.0), values)
-    return log
 
 
 def test_a_square_leaves_both_roots_and_a_level_one():

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from estimators.diagnostics.sensitivity.suspects import NO_EXPLANATION, in_words, likeliest, odds, suspects
-from estimators.log import INPUT, READING, Log
+from estimators.log import INPUT, Log
 from estimators.models import MODELS
 from estimators.tuning import Tuning
 from sources.simulator import Simulator, constant_input, stepped_input
@@ -37,6 +37,15 @@ def log():
     return found
 
 
+def off(log, sensor, error):
+    """A copy in which the readings of a sensor are off from `SINCE` on, by the error at the seconds since."""
+    wrong = log.copy()
+    rows = wrong.events.of_sensor(sensor)
+    rows = rows[wrong.t[rows] >= SINCE * 1e9]
+    wrong.value[rows, 0] += error(wrong.t[rows] * 1e-9 - SINCE)
+    return wrong
+
+
 def blamed(log):
     return suspects("ekf", MODEL, Tuning.of(MODEL), log, SINCE)
 
@@ -49,10 +58,8 @@ def test_nobody_is_blamed_for_what_is_as_it_should_be(log):
 
 @pytest.mark.parametrize("sensor", MODEL.sensor_names)
 def test_the_sensor_that_is_off_by_so_much(log, sensor):
-    s, size = MODEL.sensor_names.index(sensor), 1.5
-    wrong = log.copy()
-    late = (wrong.t[: wrong.n] >= SINCE * 1e9) & (wrong.kind[: wrong.n] == READING)
-    wrong.value[: wrong.n][late & (wrong.channel[: wrong.n] == s), 0] += size
+    size = 1.5
+    wrong = off(log, MODEL.sensor_names.index(sensor), lambda t: size)
     first = blamed(wrong)[0]
     assert (first.nudge.kind, first.nudge.name) == ("sensor", sensor)
     assert abs(first.size - size) < 4.0 * first.deviation
@@ -62,12 +69,8 @@ def test_the_sensor_that_is_off_by_so_much(log, sensor):
 @pytest.mark.parametrize("sensor", MODEL.sensor_names)
 def test_the_sensor_that_drifts_by_so_much(log, sensor):
     """It is not said to be off by a constant, nor is anything else."""
-    s, rate = MODEL.sensor_names.index(sensor), 0.05
-    wrong = log.copy()
-    t = wrong.t[: wrong.n] * 1e-9
-    late = (t >= SINCE) & (wrong.kind[: wrong.n] == READING) & (wrong.channel[: wrong.n] == s)
-    wrong.value[: wrong.n][late, 0] += rate * (t[late] - SINCE)
-    found = blamed(wrong)
+    rate = 0.05
+    found = blamed(off(log, MODEL.sensor_names.index(sensor), lambda t: rate * t))
     assert (found[0].nudge.kind, found[0].nudge.name) == ("drift", sensor)
     assert abs(found[0].size - rate) < 4.0 * found[0].deviation
     assert in_words(found) == f"sensor {sensor} drifting by {found[0].size:+.3g} °C/s"
@@ -107,10 +110,7 @@ def test_a_parameter_of_the_twin_that_is_too_small_or_too_large(log, factor, wor
 
 def test_a_parameter_without_its_error_lies_in_its_range(log):
     """An offset of a sensor would need a capacity below zero, or a change far beyond what a refold confirms."""
-    wrong = log.copy()
-    late = (wrong.t[: wrong.n] >= SINCE * 1e9) & (wrong.kind[: wrong.n] == READING)
-    wrong.value[: wrong.n][late & (wrong.channel[: wrong.n] == 0), 0] += 30.0
-    for one in blamed(wrong):
+    for one in blamed(off(log, 0, lambda t: 30.0)):
         if one.nudge.kind == "parameter":
             item = MODEL.parameters[PARAMETERS.index(one.nudge.name)]
             assert item.low <= item.value - one.size <= item.high
