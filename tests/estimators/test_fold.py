@@ -295,15 +295,6 @@ def test_reset_is_a_fresh_start(estimator):
     np.testing.assert_array_equal(track.mean[at], MATRICES.mean)
 
 
-def test_reset_keeps_the_inputs(estimator):
-    """Inputs are facts about the asset, not beliefs: a reset does not forget them."""
-    log = log_of(MODEL.width, (0, INPUT, [5.0, -3.0]), (1, RESET, ()), (2, TICK, ()))
-    track = fold(estimator, MODEL, Tuning.of(MODEL), log)
-    expected = MATRICES.mean + MATRICES.A @ MATRICES.mean + MATRICES.B @ [5.0, -3.0]
-    # One step of a linear map: a few roundings of numbers of order 10.
-    np.testing.assert_allclose(track.mean[2], expected, rtol=1e-13, atol=1e-13)
-
-
 def test_dt_of_zero_predicts_nothing(estimator):
     log = log_of(3, (3, READING, 1.0), (3, READING, [np.nan] * 2, 1), (3, READING, np.nan))
     track = fold(estimator, MODEL, Tuning.of(MODEL), log)
@@ -359,12 +350,16 @@ def test_an_unused_sensor_is_held_out_and_a_gated_one_stays_held_out(estimator):
     assert fold(estimator, MODEL, tuning, log).verdict[0] == HELD_OUT
 
 
-def test_inputs_that_are_nan_stay(estimator):
-    growing = folded(estimator, MODEL, log_of(MODEL.width, (0, INPUT, [5.0, np.nan]), (1, TICK, ())))
+@pytest.mark.parametrize("kinds", [(TICK,), (RESET, TICK)])
+def test_inputs_that_are_nan_stay_and_a_reset_keeps_them(estimator, kinds):
+    """Inputs are facts about the asset, not beliefs."""
+    later = ((k, kind, ()) for k, kind in enumerate(kinds, start=1))
+    growing = folded(estimator, MODEL, log_of(MODEL.width, (0, INPUT, [5.0, np.nan]), *later))
     u = np.array([5.0, MATRICES.u[1]])
     np.testing.assert_array_equal(growing.u, u)
     expected = MATRICES.mean + MATRICES.A @ MATRICES.mean + MATRICES.B @ u
-    np.testing.assert_allclose(growing.track.mean[1], expected, rtol=1e-13, atol=1e-13)
+    # One step of a linear map: a few roundings of numbers of order 10.
+    np.testing.assert_allclose(growing.track.mean[-1], expected, rtol=1e-13, atol=1e-13)
 
 
 @FEW

@@ -1,5 +1,7 @@
 """The steady-state filter against Riccati's recursion in NumPy, a long Kalman run, and what it must refuse."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
@@ -14,7 +16,7 @@ from estimators.track import USED
 from estimators.tuning import Tuning
 from tests.estimators.interpreted.test_filterpy import PENDULUM
 from tests.estimators.linear_models import random_linear
-from tests.models import first_state
+from tests.models import constant_speed, first_state, second_state
 from tests.support import SECOND, log_of
 from tests.support import folded as advanced
 
@@ -115,14 +117,16 @@ TWO_ROWS = StateSpaceModel(
 )
 
 
-def test_two_rows_an_input_split_steps_and_a_row_that_is_missing():
+@pytest.mark.parametrize("correlation", [None, ((1.0, 0.8), (0.8, 1.0))])
+def test_two_rows_an_input_split_steps_and_a_row_that_is_missing(correlation):
     """The Kalman filter's estimate after 300 readings 0.25 s apart, which the model crosses in three steps."""
+    model = replace(TWO_ROWS, sensors=(replace(TWO_ROWS.sensors[0], correlation=correlation),))
     rng = np.random.default_rng(3)
     values = rng.normal(0, 1, (300, 2))
     values[150, 1] = values[170, 0] = np.nan
     log = readings(values, 0.25 * np.arange(300))
-    steady = folded("kf-steady", log, Tuning.of(TWO_ROWS).with_options({"period": 0.25}), TWO_ROWS)
-    kalman = folded("kf", log, model=TWO_ROWS)
+    steady = folded("kf-steady", log, Tuning.of(model).with_options({"period": 0.25}), model)
+    kalman = folded("kf", log, model=model)
     assert np.all(steady.track.verdict == USED)
     for a, b in zip(steady.moments(), kalman.moments(), strict=True):
         np.testing.assert_allclose(a, b, rtol=1e-9, atol=1e-9)
@@ -147,15 +151,6 @@ def geared(x, u, p, dt, out):
     out[1] = x[1]
 
 
-def drift(x, u, p, dt, out):
-    out[0] = x[0] + dt * x[1]
-    out[1] = x[1]
-
-
-def second(x, u, p, out):
-    out[0] = x[1]
-
-
 def linear(f, h=first_state, *, inputs=()):
     return StateSpaceModel(
         name=f.__name__,
@@ -175,7 +170,10 @@ def linear(f, h=first_state, *, inputs=()):
         (PENDULUM, "pendulum is not linear"),
         (random_linear(np.random.default_rng(0), 2, 0).model, "linear has 3 sensors.*no one steady state"),
         (linear(geared, inputs=(Input("gear", "1"),)), "geared varies with its inputs"),
-        (linear(drift, second), "drift is not detectable: y does not observe place, which does not decay"),
+        (
+            linear(constant_speed, second_state),
+            "constant_speed is not detectable: y does not observe place, which",
+        ),
     ],
 )
 def test_it_refuses_with_the_reason(model, reason):
@@ -184,32 +182,8 @@ def test_it_refuses_with_the_reason(model, reason):
 
 
 def test_it_refuses_a_state_that_is_known_ever_better():
-    model = linear(drift)
+    model = linear(constant_speed)
     tuning = Tuning.of(model).set("Q.place", 0.0).set("Q.speed", 0.0)
-    with pytest.raises(EstimatorError, match="drift has no steady gain, as speed neither decays.*raise its Q"):
+    with pytest.raises(EstimatorError, match="constant_speed has no steady gain, as speed neither decays.*raise its Q"):
         Fold("kf-steady", model, tuning.with_options({"period": 2.0}), Log(1))
     assert ESTIMATORS["kf-steady"].applies(model) is None
-
-
-def test_the_steady_gain_of_correlated_rows():
-    """After a long run of all rows it is where the Kalman filter ends, and a lost row is the Kalman filter's too."""
-    declared = StateSpaceModel(
-        name="pair",
-        title="temperature and rate, read by one instrument",
-        states=MOTOR.states,
-        noises=MOTOR.noises,
-        sensors=(Sensor("y", (Row("a", "1", 0.5), Row("b", "1", 2.0)), h=both, correlation=((1.0, 0.8), (0.8, 1.0))),),
-        f=MOTOR.f,
-        Q=MOTOR.Q,
-        linear=True,
-    )
-    y = np.random.default_rng(5).normal(0, 1.0, (1500, 2)) + [36.0, 0.0]
-    steady, kalman = (folded(name, readings(y), model=declared) for name in ("kf-steady", "kf"))
-    for a, b in zip(steady.moments(), kalman.moments(), strict=True):
-        np.testing.assert_allclose(a, b, rtol=1e-9)
-    assert steady._now.state[-1] == AFTER
-
-
-def both(x, u, p, out):
-    out[0] = x[0]
-    out[1] = x[1] + 0.1 * x[0]

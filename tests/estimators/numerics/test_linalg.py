@@ -101,26 +101,14 @@ def test_solves_with_leading_rows_leave_the_rest():
         np.testing.assert_array_equal(x[3:], b[3:])
 
 
-@pytest.mark.parametrize("n", SIZES)
-@pytest.mark.parametrize("sparse", [False, True])
-def test_congruence(n, sparse):
-    """F P Fᵀ, exactly symmetric; zeros of F, which are skipped, included."""
-    rng = np.random.default_rng(n)
-    P = spd(rng, n)
-    F = rng.normal(0, 1, (n, n)) * (rng.random((n, n)) < (0.4 if sparse else 1.0))
-    expected = F @ P @ F.T
-    congruence_of(F, n, P, np.full((2 * n, n), np.nan))
-    np.testing.assert_allclose(P, expected, rtol=0, atol=1e-13 * n * max(1.0, np.abs(expected).max()))
-    np.testing.assert_array_equal(P, P.T)
-
-
-@pytest.mark.parametrize(("n", "rows"), [(2, 1), (5, 2), (8, 7), (33, 4)])
-def test_congruence_of_a_bordered_matrix(n, rows):
-    """Beyond its first rows F is the identity, as with parameters that a joint model adds."""
+@pytest.mark.parametrize("share", [1.0, 0.4])
+@pytest.mark.parametrize(("n", "rows"), [*((n, n) for n in SIZES), (2, 1), (5, 2), (8, 7), (33, 4)])
+def test_congruence(n, rows, share):
+    """F P Fᵀ, exactly symmetric; zeros of F are skipped, and its last rows may be those of the identity."""
     rng = np.random.default_rng(n)
     P = spd(rng, n)
     F = np.eye(n)
-    F[:rows] = rng.normal(0, 1, (rows, n))
+    F[:rows] = rng.normal(0, 1, (rows, n)) * (rng.random((rows, n)) < share)
     expected = F @ P @ F.T
     congruence_of(F, rows, P, np.full((2 * n, n), np.nan))
     np.testing.assert_allclose(P, expected, rtol=0, atol=1e-13 * n * max(1.0, np.abs(expected).max()))

@@ -13,7 +13,7 @@ from estimators.model.state_space import Jump, Noise, Row, Sensor, State, StateS
 from estimators.particle.cloud import RECOVERIES
 from estimators.track import FAILED, USED
 from estimators.tuning import Tuning
-from tests.estimators.linear_models import random_linear, random_log
+from tests.estimators.linear_models import assert_mean, random_linear, random_log
 from tests.estimators.particle.test_particle_filters import same_in_pieces_and_on_any_threads
 from tests.support import SECOND, folded, log_of
 
@@ -114,15 +114,10 @@ def test_a_jump_markov_system_gives_the_mixture_over_all_mode_sequences():
     model, log = jump_model(), after_prior(*READINGS)
     few = runs(model, 400, 60, log)
     for k, (mean, cov) in enumerate(answers, start=1):
-        means = np.array([run.mean[k] for run in few])
-        # The mean of 60 runs is right to its own standard error, but for a bias of 1/N of the posterior's spread.
-        error = means.std(axis=0, ddof=1) / np.sqrt(len(few))
-        assert np.all(np.abs(means.mean(axis=0) - mean) < 5 * error + 5 / 400 * np.sqrt(np.diag(cov))), k
-        variance = np.array([run.std[k] ** 2 for run in few])
-        error = variance.std(axis=0, ddof=1) / np.sqrt(len(few))
-        assert np.all(np.abs(variance.mean(axis=0) - np.diag(cov)) < 5 * error + 5 / 400 * np.diag(cov)), k
-    ratio = np.exp(np.array([np.nansum(run.log_likelihood) for run in few]) - total)
-    assert abs(ratio.mean() - 1) < 5 * ratio.std(ddof=1) / np.sqrt(len(few))
+        # A bias of 1/N of the posterior's spread.
+        assert_mean([run.mean[k] for run in few], mean, 5 / 400 * np.sqrt(np.diag(cov)))
+        assert_mean([run.std[k] ** 2 for run in few], np.diag(cov), 5 / 400 * np.diag(cov))
+    assert_mean([np.exp(np.nansum(run.log_likelihood) - total) for run in few], 1.0)
 
     def off(n):
         last = np.array([run.mean[-1] - answers[-1][0] for run in runs(model, n, 60, log)])
@@ -178,14 +173,11 @@ def test_what_the_sampled_state_did_tells_of_the_linear_one():
     few = runs(model, 1000, 40, log)
     for k in range(1, 7):
         exact, spread = np.mean([run.mean[k] for run in reference], axis=0), reference[0].std[k]
-        means = np.array([run.mean[k] for run in few])
-        error = means.std(axis=0, ddof=1) / np.sqrt(len(few))
         # pf's own error, of some √(10/300,000) of the spread, and a bias of 1/N.
-        assert np.all(np.abs(means.mean(axis=0) - exact) < 5 * error + 0.02 * spread), k
+        assert_mean([run.mean[k] for run in few], exact, 0.02 * spread)
         assert np.all(np.abs(np.mean([run.std[k] for run in few], axis=0) / spread - 1) < 0.03), k
     total = np.mean([np.nansum(run.log_likelihood) for run in reference])
-    ratio = np.exp([np.nansum(run.log_likelihood) - total for run in few])
-    assert abs(np.mean(ratio) - 1) < 5 * np.std(ratio) / np.sqrt(len(few)) + 0.02
+    assert_mean([np.exp(np.nansum(run.log_likelihood) - total) for run in few], 1.0, 0.02)
 
 
 @pytest.mark.parametrize("n", [300, 5000])
