@@ -71,13 +71,15 @@ RUNNING = [
 ]
 
 
-@pytest.mark.parametrize("estimator", RUNNING)
+@pytest.mark.parametrize("estimator", [*RUNNING, "kf with maintenance"])
 def test_the_sum_is_the_change_and_the_fold_is_as_it_would_have_been(estimator):
+    estimator, maintenance, _ = estimator.partition(" with maintenance")
     rng = np.random.default_rng(3)
     matrices = random_linear(rng, 3, 2)
     log = random_log(rng, matrices, 120)
     width = matrices.model.width
     log.extend(Events.one(8 * SECOND, 8 * SECOND, TICK, 0, np.full(width, np.nan), width))
+    log.extend(maintained(8 * SECOND, 8 * SECOND, (0,) if maintenance else (), width))
     tuning = Tuning.of(matrices.model)
     whole, fold = (Fold(estimator, matrices.model, tuning, log) for _ in range(2))
     whole.advance()
@@ -104,17 +106,6 @@ def test_the_largest_corrections_are_those_of_the_track():
         assert sum(item.change for item in corrections if item.sensor == 0) == pytest.approx(
             found.sensors[0][j], abs=sum(sizes[-1] for _ in range(found.readings[0]))
         )
-
-
-def test_maintenance_is_part_of_the_sum():
-    rng = np.random.default_rng(5)
-    matrices = random_linear(rng, 2, 1)
-    log = random_log(rng, matrices, 100)
-    log.extend(maintained(8 * SECOND, 8 * SECOND, (0,), matrices.model.width))
-    fold = Fold("kf", matrices.model, Tuning.of(matrices.model), log)
-    found = attribution(fold, SINCE, UNTIL)
-    total = found.model + found.inputs.sum(axis=0) + found.sensors.sum(axis=0) + found.restarts
-    np.testing.assert_allclose(total, found.after - found.before, rtol=0, atol=1e-9)
 
 
 def test_a_span_without_events_or_with_too_many_is_refused(monkeypatch):
