@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import threading
 import time
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from functools import partial
 from typing import NamedTuple
 
@@ -113,8 +113,10 @@ def _severity(episode: Episode) -> tuple[int, float]:
 class EpisodeLog:
     """Episodes of one engine; any thread may read `summary`, which is replaced, never changed."""
 
-    def __init__(self, engine: Running, max_rows: int = MAX_ROWS, others: Sequence[TrackedEpisode] = ()) -> None:
-        """`max_rows`: see `EpisodeTracker`; `others` are episodes that no row shows, a sequence that grows."""
+    def __init__(
+        self, engine: Running, max_rows: int = MAX_ROWS, others: Callable[[], Iterable[TrackedEpisode]] = tuple
+    ) -> None:
+        """`max_rows`: see `EpisodeTracker`; `others` returns the episodes that no row shows."""
         self._others = others
         self._engine, self._max_rows = engine, max_rows
         self._cursor = engine.cursor()
@@ -184,7 +186,7 @@ class EpisodeLog:
                 break
         tracker = self.tracker
         if tracker.n:
-            self._entries = sorted([*tracker.entries, *self._others], key=lambda entry: entry.episode.start)
+            self._entries = sorted([*tracker.entries, *self._others()], key=lambda entry: entry.episode.start)
             entries = _joined(self._earlier, self._entries)
             self.summary = EpisodeSummary(
                 tuple(entry.episode for entry in entries),

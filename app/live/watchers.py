@@ -4,14 +4,16 @@ from __future__ import annotations
 
 import math
 import time
-from collections import deque
+from collections import Counter, deque
 from collections.abc import Callable
-from typing import TYPE_CHECKING
+from types import SimpleNamespace
 
 import numpy as np
 
 from estimators.diagnostics.clock_fit import ClockFit, LeastDelays
-from estimators.diagnostics.episodes import TrackedEpisode
+from estimators.diagnostics.detectors import detector_of
+from estimators.diagnostics.episodes import Episode, TrackedEpisode
+from estimators.diagnostics.repeats import HELD, UNDECIDED, find_repeats, sensor_rows
 from estimators.log import INPUT, READING, Events
 from estimators.track import STALE, TRACKING, WAITING
 from sources.source import LOST_FRAMES, Source, controls_of, is_utc
@@ -20,11 +22,9 @@ from ..ingest import dropped_episode
 from .alerts import Alerts
 from .episode_log import EPISODES_PERIOD_S, EpisodeLog
 from .fault_monitors import LEVELS_PERIOD_S, ROOT_CAUSE_PERIOD_S, ProtectionMonitor, RootCause
+from .jobs import Job
 from .notices import Notices
 from .running_fold import Running
-
-if TYPE_CHECKING:
-    from estimators.diagnostics.episodes import Episode
 
 LOSS_CAUSE_S = 10.0  # Seconds for which frames that the bus lost are the cause of a poor health
 
@@ -38,7 +38,8 @@ class Watchers:
         self.latency = Latency()
         self.clock = HostClock(notices, section.horizon)
         self.dropped = DroppedShare()
-        self.episode_log = EpisodeLog(engine, others=self.dropped.entries)
+        self.repeats = RepeatedValues(engine)
+        self.episode_log = EpisodeLog(engine, others=lambda: (*self.dropped.entries, *self.repeats.entries))
         self.alerts = Alerts(notices, lambda: self.episode_log.summary.in_alarm)
         self.silence = SilentSource(notices, section.stale_after)
         self.integrity = ProtectionMonitor(engine.last_events, engine.policy.false_alarm_every)
@@ -49,6 +50,7 @@ class Watchers:
         self._jobs.run("episodes", self.episode_log.look, every=EPISODES_PERIOD_S)
         self._jobs.run("protection levels", self.integrity.look, every=LEVELS_PERIOD_S)
         self._jobs.run("root cause", self.root_cause.update, every=ROOT_CAUSE_PERIOD_S)
+        self._jobs.run("repeated values", self.repeats.look, every=REPEATS_PERIOD_S)
 
     def stop(self) -> None:
         """Look at the last rows and end."""
@@ -195,9 +197,7 @@ MAX_DROPPED_SHARE, MIN_DROPPED, DROPPED_PERIOD_S = 0.1, 10, 60.0
 class DroppedShare:
     """Episodes in which many measurements of a live source are too late for the log, or have impossible times."""
 
-    def __init__(self, clock: Callable[[], float] = time.monotonic) -> None:
-        """`clock` returns seconds."""
-        self._clock = clock
+    def __init__(self) -> None:
         self._recent: deque[tuple[float, int, int]] = deque()
         self._taken = self._dropped = 0
         self.entries: list[TrackedEpisode] = []
@@ -207,20 +207,78 @@ class DroppedShare:
 
         An episode ends when their share is half of that with which it begins.
         """
-        now = self._clock()
+        now = time.monotonic()
         self._recent.append((now, taken, dropped))
         self._taken, self._dropped = self._taken + taken, self._dropped + dropped
         while self._recent[0][0] <= now - DROPPED_PERIOD_S:
             _, before, lost = self._recent.popleft()
             self._taken, self._dropped = self._taken - before, self._dropped - lost
-        last = self.entries[-1].episode if self.entries else None
-        if last is not None and last.end is None:
-            if self._dropped < 0.5 * MAX_DROPPED_SHARE * self._taken:
-                over = last._replace(end=newest * 1e-9)
-                self.entries[-1:] = [self.entries[-1]._replace(until=newest, episode=over)]
-        elif self._dropped >= max(MIN_DROPPED, MAX_DROPPED_SHARE * self._taken):
-            episode = dropped_episode(newest * 1e-9, self._dropped, self._taken)
-            self.entries.append(TrackedEpisode(("dropped", "twin"), newest, newest, episode))
+        if self._dropped >= max(MIN_DROPPED, MAX_DROPPED_SHARE * self._taken):
+            _begin(self.entries, newest, dropped_episode(newest * 1e-9, self._dropped, self._taken))
+        elif self._dropped < 0.5 * MAX_DROPPED_SHARE * self._taken:
+            _end(self.entries, newest, "dropped", "twin")
+
+
+def _begin(entries: list[TrackedEpisode], newest: int, episode: Episode) -> None:
+    """Add an episode at the log's newest event (ns), unless one of its cause and subject lasts."""
+    key = episode.cause, episode.subject
+    if not any(entry.key == key and entry.episode.end is None for entry in entries):
+        entries.append(TrackedEpisode(key, newest, newest, episode))
+
+
+def _end(entries: list[TrackedEpisode], newest: int, *key: str) -> None:
+    """End the episode of this cause and subject, if one lasts."""
+    for k, entry in enumerate(entries):
+        if entry.key == key and entry.episode.end is None:
+            entries[k] = entry._replace(until=newest, episode=entry.episode._replace(end=newest * 1e-9))
+
+
+REPEATS_PERIOD_S, REPEATS_CPU_SHARE = 5.0, 0.01
+"""Seconds between two searches for repeats, and the share of a processor that they may take, else they are rarer."""
+
+REPEATS_OVER = 4
+"""Searches in a row that find none, after which an episode is over: coarse values hide repeats now and then."""
+
+REPEATS_EVENTS = 51_200
+"""Latest events of the log that are searched."""
+
+REPEATS_VALUES = (200, 800, 3200, 12_800, REPEATS_EVENTS)
+"""Latest values of a row that are searched: a hold is found once it has 15 new values in one of these."""
+
+
+class RepeatedValues:
+    """Episodes in which the rows of a sensor of a live source are repeats, of which each new value is held."""
+
+    def __init__(self, engine: Running) -> None:
+        self._engine = engine
+        self.entries: list[TrackedEpisode] = []
+        self._since = Counter[str]()
+        """Searches of each row since repeats were found in it."""
+
+    def look(self, job: Job) -> float:
+        """Search the last values of each sensor row; return the seconds to the next time."""
+        if not self._engine.source.live:
+            return math.inf
+        begun, taken = time.thread_time(), self._engine.last_events(REPEATS_EVENTS)
+        events = Events.empty(1) if taken is None else taken.events
+        for _, row, column, known in sensor_rows(self._engine.model, events):
+            job.check()
+            self._judge(row, events.t[known], events.value[known, column])
+        return max(REPEATS_PERIOD_S, (time.thread_time() - begun) / REPEATS_CPU_SHARE)
+
+    def _judge(self, row: str, t: np.ndarray, values: np.ndarray) -> None:
+        found = {n: find_repeats(t[-n:], values[-n:]) for n in REPEATS_VALUES if n < 4 * t.size}
+        held = next(((float(t[-n:][0]) * 1e-9, one) for n, one in found.items() if one.kind == HELD), None)
+        if held is not None:
+            begun, one = held
+            text = detector_of("repeating").text(SimpleNamespace(name=row, repeats=one))
+            episode = Episode(begun, None, row, "repeating", one.share, math.nan, math.nan, "", text)
+            _begin(self.entries, int(t[-1]), episode)
+            self._since[row] = 0
+        elif any(one.kind != UNDECIDED for one in found.values()):
+            self._since[row] += 1
+            if self._since[row] >= REPEATS_OVER:
+                _end(self.entries, int(t[-1]), "repeating", row)
 
 
 MAX_LATENCIES = 4096

@@ -300,6 +300,13 @@ DETECTORS = (
         statistic="share of measurements that are not in the log",
         effect="share of measurements",
     ),
+    Detector(
+        "repeating",
+        "{0.name} repeats its values: {0.repeats.reason}",
+        "give its channel in `source` the key repeats: {0.repeats.key}",
+        statistic="share of large changes that are followed by equal values, and runs of equal values",
+        effect="share of measurements",
+    ),
 )
 """Order: the alarms, in the order of their bits in `Track.alarms`, then what is found otherwise."""
 

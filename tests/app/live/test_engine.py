@@ -17,6 +17,7 @@ from app.live import commands
 from app.live.alerts import Alerts
 from app.live.batches import BatchSizer
 from app.live.engine import Engine
+from app.live.jobs import Job
 from app.live.notices import Notices
 from app.twin.twin import load_twin
 from estimators.fold import Fold, fold
@@ -145,6 +146,25 @@ def test_measurements_beyond_the_horizon_are_counted_and_dropped():
         stepped.engine._watchers.episode_log.update()
     episode = next(item for item in stepped.engine.episodes() if item.cause == "dropped")
     assert (episode.start, episode.end, episode.size) == (61 * SECOND * 1e-9, 1099 * SECOND * 1e-9, 52 / 105)
+
+
+@pytest.mark.parametrize(("step", "std", "told"), [(0.0, 2.0, 1), (0.5, 2.0, 1), (2.0, 2.0, 0), (2.0, 0.6, 0)])
+def test_a_source_that_begins_to_hold_its_values_is_an_episode(step, std, told):
+    """Ten measurements a second; from 60 s to 120 s each tenth is repeated; values as coarse as the noise hide that."""
+    t, y = 0.1 * np.arange(1, 2101), 40.0 + np.random.default_rng(1).normal(0.0, std, 2100)
+    y[600:1200] = np.repeat(y[600:1200:10], 10)
+    stepped = Stepped(source=Scripted(live=True))
+    for rows in np.array_split(np.arange(t.size), 42):
+        stepped.put(readings(t[rows], np.round(y[rows] / step) * step if step else y[rows]))
+        stepped.engine._watchers.repeats.look(Job("repeats"))
+    found = stepped.engine._watchers.repeats.entries
+    assert len(found) == told
+    for entry in found:
+        assert 60.0 < entry.at / SECOND <= 90.0 and 120.0 < entry.episode.end <= 140.0
+        assert entry.episode.text.replace("91 %", "90 %") == (  # coarse values may be equal by chance
+            "winding repeats its values: new value every 1 s, repeated in 90 % of rows; give its channel in `source` "
+            "the key repeats: every 1 s"
+        )
 
 
 @pytest.mark.parametrize(
