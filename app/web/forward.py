@@ -97,13 +97,19 @@ class Forwarded(Response):
         connection, begun = h11.Connection(h11.CLIENT), False
         connection.send(h11.Request(method=scope["method"], target="/", headers=[("host", "x")]))
         connection.send(h11.EndOfMessage())
+        # Relative, as the service may be behind a proxy at any path.
+        origin, root = f"http://127.0.0.1:{self._twin.port}/".encode(), b"./" + b"../" * (self._path.count("/") - 1)
         with suppress(OSError, h11.RemoteProtocolError):
             while True:
                 event = connection.next_event()
                 if event is h11.NEED_DATA:
                     connection.receive_data(await reader.read(PIECE_BYTES))
                 elif isinstance(event, h11.Response):
-                    headers = [(name, value) for name, value in event.headers if name not in HOP_HEADERS]
+                    headers = [
+                        (name, value.replace(origin, root, 1) if name == b"location" else value)
+                        for name, value in event.headers
+                        if name not in HOP_HEADERS
+                    ]
                     await send({"type": "http.response.start", "status": event.status_code, "headers": headers})
                     begun = True
                 elif isinstance(event, h11.Data):
