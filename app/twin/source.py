@@ -111,7 +111,17 @@ class Plan:
     def open(
         self, report: Report, *, live: bool = True, speed: float | None = None, faults: Faults | None = None
     ) -> Source:
-        """Open the source behind its faults; see `Twin.open_source`."""
+        """Open the source behind its faults.
+
+        Args:
+            report: Called as report(key, text) for counted events, from the source's thread.
+            live: False asks for events that end: a recording in place of a bus.
+            speed: Times real time, for a source that is not live; None is as fast as it is read.
+            faults: A layer of `faults`, for a source that is opened again; None makes one.
+
+        Raises:
+            SourceError: If it cannot be opened, with the remedy.
+        """
         from sources.faults.layer import FaultySource
 
         layer = self.faults() if faults is None else faults

@@ -37,7 +37,6 @@ from .model import configure, find_model, model_files
 from .source import Plan, plan_source
 
 if TYPE_CHECKING:
-    from sources.faults.layer import Faults
     from sources.source import Report, Source
 
 VERSION = "tuning"
@@ -182,21 +181,9 @@ class Twin:
         """Return the YAML's options of an estimator; choices as their numbers."""
         return _options(self.config, estimator)
 
-    def open_source(
-        self, report: Report, *, live: bool = True, speed: float | None = None, faults: Faults | None = None
-    ) -> Source:
-        """Open the source, behind its faults.
-
-        Args:
-            report: Called as report(key, text) for counted events, from the source's thread.
-            live: False asks for events that end: a recording in place of a bus.
-            speed: Times real time, for a source that is not live; None is as fast as it is read.
-            faults: A layer of `plan.faults`, for a source that is opened again; None makes one.
-
-        Raises:
-            SourceError: If it cannot be opened, with the remedy.
-        """
-        return self.plan.open(report, live=live, speed=speed, faults=faults)
+    def open_source(self, report: Report, **options: Any) -> Source:
+        """Open the source, behind its faults; see `Plan.open`."""
+        return self.plan.open(report, **options)
 
 
 def load_twin(

@@ -6,7 +6,7 @@ A job folds the events, one value after another, the nearest first, and ends as 
 from __future__ import annotations
 
 import threading
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -264,12 +264,12 @@ def value_of(tuning: Tuning, key: str) -> float:
     return float(value)
 
 
-def values_around(tuning: Tuning, key: str, factors: Sequence[float] = FACTORS) -> list[tuple[float, Tuning]]:
+def values_around(tuning: Tuning, key: str) -> list[tuple[float, Tuning]]:
     """Return a tuning for each factor within the entry's range, the nearest to 1 first; none if the value is zero."""
     if key not in GROUPS and value_of(tuning, key) == 0.0:
         return []
     found = []
-    for factor in sorted(factors, key=lambda factor: (abs(np.log(factor)), factor)):
+    for factor in sorted(FACTORS, key=lambda factor: (abs(np.log(factor)), factor)):
         try:
             found.append((factor, scaled(tuning, key, factor)))
         except ConfigError:

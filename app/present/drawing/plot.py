@@ -145,10 +145,10 @@ class TrackSeries:
         return measured_by(self.model)
 
 
-def draw_state(axes: Axes, series: TrackSeries, name: str, *, unit: TimeUnit = SECONDS, size: float = 1.0) -> None:
+def draw_state(axes: Axes, series: TrackSeries, name: str, *, unit: TimeUnit = SECONDS) -> None:
     """Draw a state over time: estimate with ± 2 σ, measurements, rejected ones, and the truth where it is known.
 
-    An angle is drawn between -π and π. Lines and dots are scaled by `size`.
+    An angle is drawn between -π and π.
     """
     estimate, measured, rejected = (hex_color(color) for color in (LIGHT.estimate, LIGHT.reading, LIGHT.refused))
     state = next(item for item in series.model.shown_states if item.name == name)
@@ -179,16 +179,16 @@ def draw_state(axes: Axes, series: TrackSeries, name: str, *, unit: TimeUnit = S
         axes.fill_between(
             seconds / unit.seconds, *edges, color=estimate, alpha=0.16, lw=0, label="± 2 σ", clip_on=False
         )
-    dots("reading", "measurement", marker="o", ms=2.2 * size, color=measured)
-    dots("held", "held out", marker="o", ms=2.6 * size, mfc="none", mew=0.6, mec=measured)
-    plot(seconds, mean, color=estimate, lw=1.3 * size, label="estimate")
-    dots("refused", "rejected", marker="o", ms=3.2 * size, color=rejected)
-    dots("screened", "implausible", marker="x", ms=3.2 * size, mew=0.8, color=rejected)
+    dots("reading", "measurement", marker="o", ms=2.2, color=measured)
+    dots("held", "held out", marker="o", ms=2.6, mfc="none", mew=0.6, mec=measured)
+    plot(seconds, mean, color=estimate, lw=1.3, label="estimate")
+    dots("refused", "rejected", marker="o", ms=3.2, color=rejected)
+    dots("screened", "implausible", marker="x", ms=3.2, mew=0.8, color=rejected)
     seconds, truth = series[f"truth:{name}"]
     known = np.isfinite(truth)
     truth = _wrapped(truth[known], turn)
     truth[1:][np.abs(np.diff(truth)) > 0.5 * turn] = np.nan
-    plot(seconds[known], truth, color=hex_color(LIGHT.truth), lw=0.9 * size, ls=(0, (4, 3)), label="truth")
+    plot(seconds[known], truth, color=hex_color(LIGHT.truth), lw=0.9, ls=(0, (4, 3)), label="truth")
 
 
 def _wrapped(values: np.ndarray, turn: float) -> np.ndarray:

@@ -55,7 +55,7 @@ class BatteryScene:
         if temperature:
             labels = [f"cell {k + 1}" for k in range(len(temperature))] if len(temperature) > 1 else ["temperature"]
             unit = model.states[self._temperature[0]].unit
-            self._bar = ScaleBar(shapes.below("scale"), "temperature", labels, unit, palette, y=0.0, top=low - 0.15)
+            self._bar = ScaleBar(shapes.below("scale"), labels, unit, palette, y=0.0, top=low - 0.15)
             low = self._bar.bottom
         top, wide = HEIGHT + 0.3, max(1.05, 0.5 * columns * PITCH)
         middle = np.array([0.0, 0.0, 0.5 * (low + top)])
@@ -302,7 +302,7 @@ class MotorScene:
             for part in parts
         ]
         unit = model.states[self._states[0]].unit
-        self._bar = ScaleBar(shapes.below("scale"), "temperature", list(parts), unit, palette, y=-0.8, top=-1.15)
+        self._bar = ScaleBar(shapes.below("scale"), list(parts), unit, palette, y=-0.8, top=-1.15)
         corners = np.array([[x, y, z] for x in (-1.05, 1.05) for y in (-0.8, 0.8) for z in (self._bar.bottom, 1.02)])
         middle = np.array([0.0, 0.0, 0.5 * (self._bar.bottom + 1.02)])
         self.root.position = -middle
@@ -325,14 +325,14 @@ ROW_HEIGHT = 0.26  # Height of the line of a quantity, with its text
 
 
 class ScaleBar:
-    """Upright scale of colours with title and unit, x from -1 to 1, with mean and ± 2σ of each quantity below it."""
+    """Upright scale of temperatures with its unit, x from -1 to 1, with mean and ± 2σ of each quantity below it."""
 
     def __init__(
-        self, shapes: Shapes, title: str, labels: Sequence[str], unit: str, theme: Palette, *, y: float, top: float
+        self, shapes: Shapes, labels: Sequence[str], unit: str, theme: Palette, *, y: float, top: float
     ) -> None:
         self._labels, self._unit, self._y, self._top = labels, unit, y, top
         self.title = shapes.label(
-            "title", f"{title} [{unit}]", 0.85, position=(0.0, y, top - 0.24), anchor="top-center"
+            "title", f"temperature [{unit}]", 0.85, position=(0.0, y, top - 0.24), anchor="top-center"
         )
         self._scale, self._colors = Scale(ESTIMATE), gradient(ESTIMATE.colors)
         strip = np.repeat(self._colors[:UNKNOWN_INDEX][None], 8, axis=0)

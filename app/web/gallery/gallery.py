@@ -177,8 +177,8 @@ FILE_POLL_PERIOD_S = 0.4
 class SavedFiles:
     """Watches the files of the running twin, in a thread of its own."""
 
-    def __init__(self, gallery: Gallery, *, every: float = FILE_POLL_PERIOD_S) -> None:
-        self._gallery, self._every = gallery, every
+    def __init__(self, gallery: Gallery) -> None:
+        self._gallery = gallery
         # A weak reference does not keep it alive.
         self._of: weakref.ref[RunningTwin] | None = None
         self._files: tuple[Path, ...] = ()
@@ -250,7 +250,7 @@ class SavedFiles:
         running.engine.notices.say(f"not read again: {text}", level="error")
 
     def _run(self) -> None:
-        while not self._stopping.wait(self._every):
+        while not self._stopping.wait(FILE_POLL_PERIOD_S):
             try:
                 self.look()
             except NisusError as error:
