@@ -13,11 +13,14 @@ import operator
 import os
 import re
 import sys
+import warnings
 from collections.abc import Sequence
+from pathlib import Path
 from typing import Annotated, Any
 
 import tyro
 
+from config.yaml_files import shown_path
 from estimators.errors import ConfigError, NisusError, nearest, shown_name
 
 from ..terminal import complain
@@ -102,6 +105,8 @@ def described(command: type) -> str:
 def main(arguments: Sequence[str] | None = None) -> int:
     """Entry point: 0 if all went well, 2 with one line on standard error if not."""
     given = sys.argv[1:] if arguments is None else arguments
+    if not sys.warnoptions:
+        warnings.showwarning = _show_warning
     try:
         try:
             return _answered(given)
@@ -114,6 +119,12 @@ def main(arguments: Sequence[str] | None = None) -> int:
         complain(f"standard output: {error.strerror or error}")
         _drop_output()
         return 2
+
+
+def _show_warning(message: object, category: type, filename: str, lineno: int, *_: Any, **__: Any) -> None:
+    """Print a warning in one line; none of arithmetic, whose results are checked and shown as missing or failed."""
+    if not issubclass(category, RuntimeWarning):
+        complain(f"{shown_path(Path(filename))}:{lineno}: {message}")
 
 
 def _answered(arguments: Sequence[str]) -> int:

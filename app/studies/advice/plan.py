@@ -13,7 +13,7 @@ import numpy as np
 
 from estimators.diagnostics.intervals import Interval
 from estimators.diagnostics.repeats import LINEAR
-from estimators.errors import ConfigError, nearest
+from estimators.errors import LARGEST, ConfigError, nearest
 from sources.inspect import RecordingContents
 from sources.units import unit_scale
 
@@ -44,6 +44,7 @@ OMISSIONS = {
     "switch": "a switch: few different values",
     "counter": "time, counter or status",
     "constant": "constant",
+    "huge": f"values beyond {LARGEST:g}",
     "short": f"fewer than {MIN_VALUES} values",
 }
 """Reasons by kind of signal for which it is omitted."""

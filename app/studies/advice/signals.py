@@ -11,6 +11,7 @@ import numpy as np
 
 from config.fields import repeat_period
 from estimators.diagnostics.repeats import SINGLE, Finding, find_repeats
+from estimators.errors import LARGEST
 from sources.inspect import RecordingContents, SignalSeries, holes
 from sources.mapping import first_of_hold
 
@@ -133,6 +134,8 @@ def _kind(series: SignalSeries, levels: np.ndarray) -> str:
         return "short"
     if levels.size == 1:
         return "constant"
+    if np.abs(levels).max() > LARGEST:
+        return "huge"
     if levels.size <= MAX_SWITCH_LEVELS:
         return "switch"
     if SKIPPED.search(series.name) or _counts_time(series):

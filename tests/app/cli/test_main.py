@@ -13,6 +13,7 @@ import pytest
 from app.cli.arguments import COMMANDS, NAMES
 from app.cli.main import described, main, parse
 from config.loader import shipped
+from tests import ROOT
 
 FULL = Path("/dev/full")
 needs_full = pytest.mark.skipif(not FULL.exists(), reason="there is no /dev/full")
@@ -39,9 +40,14 @@ def test_a_full_disk_is_reported_with_the_file(words, nisus):
 
 
 @needs_full
-def test_a_full_standard_output_is_reported():
+@pytest.mark.parametrize("words", [["twins"], ["log", "huge.csv"]])
+def test_a_full_standard_output_is_reported_and_nothing_else(words, tmp_path, monkeypatch):
+    """Such as a warning of NumPy: the squares of these values are no numbers."""
+    monkeypatch.setenv("PYTHONPATH", str(ROOT))
+    monkeypatch.chdir(tmp_path)
+    Path("huge.csv").write_text("time,a\n" + "".join(f"{k},{k % 7 - 3}e307\n" for k in range(99)))
     with FULL.open("w") as full:
-        command = [sys.executable, "-m", "app.cli.main", "twins"]
+        command = [sys.executable, "-m", "app.cli.main", *words]
         done = subprocess.run(command, stdout=full, stderr=subprocess.PIPE, text=True, check=False)
     assert (done.returncode, done.stderr) == (2, "nisus: standard output: No space left on device\n")
 
