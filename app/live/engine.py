@@ -132,6 +132,8 @@ class Engine(Running):
         self._stopping = threading.Event()
         self._finished = False
         self._idle_ticks = IdleTicks(section.tick)
+        self._prompt: int | None = None
+        """Time of the newest event when measurements were last used in time, ns."""
         self.jobs = Jobs(self.notices)
         self._watchers = Watchers(self)
         self.revisions.said = self._watchers.episodes_of
@@ -264,17 +266,20 @@ class Engine(Running):
 
     def _with_lag(self, status: Status) -> Status:
         """Return a status, of a health that shows measurements which wait for longer than one may be missing."""
-        age, late = time.monotonic() - status.heard, self._idle_ticks.late
+        age, late, since, sensors = time.monotonic() - status.heard, self._idle_ticks.late, status.t, status.sensors
         if not self._feeder.live or age <= self.policy.degraded_after or status.health in (WAITING, DIVERGED, STALE):
             return status
         if self._behind or not self._inbox.empty():
             cause = f"the filter is behind: measurements of the last {age:.3g} s are not folded yet"
         elif late > self.policy.degraded_after:
             cause = f"measurements are {late:.3g} s old when they arrive"
+            since = self._span[0] if self._prompt is None else self._prompt
+            old = dict.fromkeys(("tracking", "advisory"), ("degraded", cause))
+            sensors = {name: old.get(known[0], known) for name, known in sensors.items()}
         else:
             return status
         health = STALE if age - late > self.policy.stale_after else DEGRADED
-        return replace(status, health=health, since=status.t, cause=cause)
+        return replace(status, health=health, since=since, cause=cause, sensors=sensors)
 
     def latest(self) -> Status:
         """See `Running`."""
@@ -396,6 +401,8 @@ class Engine(Running):
             self._watchers.dropped.note(self._log.newest, len(events) + len(passed.refused), dropped)
             if np.count_nonzero((events.kind == READING) | (events.kind == INPUT)) > stale:
                 self._idle_ticks.arrived(self._feeder.source, events, self._log.newest)
+                if self._idle_ticks.late <= self.policy.degraded_after:
+                    self._prompt = self._log.newest
             if self._log.n:
                 self._watchers.silence.broken()
         self._fold_on()

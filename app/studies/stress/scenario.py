@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field, replace
+from functools import partial
 from math import nan
 from typing import TYPE_CHECKING, NamedTuple
 
@@ -259,10 +260,10 @@ class Bench:
         self, estimator: str, tuning: Tuning, log: Log, base: Base | None, prior: Mapping[str, tuple[float, float]]
     ) -> Fold:
         twin = self.twin
-        fold = Fold(estimator, twin.model, tuning, log, pairs=twin.pairs, policy=twin.policy, base=base)
+        make = partial(Fold, estimator, twin.model, tuning, log, pairs=twin.pairs, policy=twin.policy)
+        fold = make(base=base)
         if prior:
-            base = _wrong_prior(fold.base_at(0)[1], twin.model, prior)
-            fold = Fold(estimator, twin.model, tuning, log, pairs=twin.pairs, policy=twin.policy, base=base)
+            fold = make(base=_wrong_prior(fold.base_at(0)[1], twin.model, prior))
         fold.advance()
         fold.finish()
         return fold

@@ -62,6 +62,10 @@ def segments(points: np.ndarray) -> np.ndarray:
     return pairs.astype(np.float32) if len(pairs) else NO_LINE
 
 
+SQUARE = np.array([[-1, -1], [1, -1], [1, 1], [-1, 1], [-1, -1]], float)
+"""Corners (5, 2) of the square from -1 to 1, once around."""
+
+
 def disc(sides: int = 64) -> tuple[np.ndarray, np.ndarray]:
     """Return vertices and triangles of a flat disc of radius 1 in the plane z = 0."""
     angle = np.linspace(0, 2 * np.pi, sides, endpoint=False)

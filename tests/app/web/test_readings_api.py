@@ -144,6 +144,8 @@ def test_measurements_that_are_old_when_they_arrive_have_their_age(damaged_page)
     found = wait_for(lambda: (state := damaged_page.get("/api/state"))["time_ns"] == begin + 39 * SECOND and state)
     assert 3561 <= found["age_s"] < 4000 and found["health"] == "degraded" and found["estimate_valid"]
     assert found["cause"].endswith("s old when they arrive")
+    status = wait_for(lambda: (last := damaged_page.engine.status()).t == begin + 39 * SECOND and last)
+    assert status.sensors == {"winding": ("degraded", status.cause)} and status.since <= begin
     sent(damaged_page, {"values": {"winding": 40.0}})
     found = wait_for(lambda: (state := damaged_page.get("/api/state"))["time_ns"] > begin + 3600 * SECOND and state)
     assert found["age_s"] < 400 and "old when" not in found["cause"]
