@@ -150,15 +150,14 @@ class _StoredBytes:
 
     def unpack_from(self, data: bytes, at: int) -> tuple[Any, ...]:
         """Return the fields of an object whose header ends at a place."""
+        from can.io import blf
+
         fields = list(self._layout.unpack(data[at : at + self.size].ljust(self.size, b"\0")))
         header = 32 if data[at - 32 : at - 28] == b"LOBJ" else 40
-        _, _, _, size, _ = _OBJECT_HEADER.unpack_from(data, at - header)
+        *_, size, _ = blf.OBJ_HEADER_BASE_STRUCT.unpack_from(data, at - header)
         stored = (fields[self._end] if self._end is not None else 0) or size
         fields[self._count] = min(fields[self._count], max(0, stored - header - self._head))
         return tuple(fields)
-
-
-_OBJECT_HEADER = struct.Struct("<4sHHLL")
 
 
 class _Lines:

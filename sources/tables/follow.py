@@ -20,10 +20,10 @@ from estimators.errors import SourceError, nearest
 from estimators.log import Events
 
 from ..formats import is_compressed, suffix_of
-from ..mapping import ABSENT, PRESENT, ChannelMapping
+from ..mapping import ABSENT, PRESENT
 from ..source import NEVER, NO_ASSET, TRUNCATED, AssetEvents, Channel, Report, ignore
-from ..units import heading_unit
 from .rows import TableRows, dated, is_text, names_of, rows_of
+from .table import mapped
 from .text import HEAD_BYTES, UNREADABLE, Column, CsvFormat, TextCodes, chunk_of, column_of, format_of
 from .times import TimeColumn, TimeReader
 
@@ -122,15 +122,12 @@ class FollowedTable:
         self._ends, self._asset = ends, asset
         self._list, self._time, self._width, self._report = files, time, width, report
         self._shift = round(time_shift * 1e9)
-        self._columns = list(dict.fromkeys(name for channel in channels for name in channel.needed))
+        self._columns, self._mapping = mapped(channels, width, report)
         self._read_columns: list[Column] = [*self._columns, *([] if asset is None else [TextCodes(asset)])]
         self._fed = {name: channel.name for channel in channels for name in channel.needed}
         self._valueless = set(range(len(self._columns)))
         nothing = Events.empty(width)
         self._nothing = nothing if asset is None else AssetEvents(nothing, np.zeros(0, np.int64), ())
-        self._mapping = ChannelMapping(
-            [(channels, self._columns, [heading_unit(name) for name in self._columns])], width=width, report=report
-        )
         self._files: dict[int, _File] = {}
         self._open: tuple[int, Path, BinaryIO] | None = None
         """Inode, path and handle of the file that was read last; if it was moved away, its rest is read from here."""

@@ -77,7 +77,7 @@ class Table:
         self._time = TimeColumn(name, time_unit, time_format, time_zone, clock[0] if clock else None, time_date)
         self._width, self._report = width, report
         self._shift = round(time_shift * 1e9)
-        self._columns = list(dict.fromkeys(name for channel in channels for name in channel.needed))
+        self._columns, self._mapping = mapped(channels, width, report)
         for path in self._files:
             _check(path, [*self._time.names, *map(column_of, self._columns)])
         self._channels = channels
@@ -85,9 +85,6 @@ class Table:
         self._valued: set[str | TextMatch] = set()
         self._count = 0
         self._timeout = 0.0
-        self._mapping = ChannelMapping(
-            [(channels, self._columns, [heading_unit(name) for name in self._columns])], width=width, report=report
-        )
         self._order = Order(self._time.label, time_unit, None if horizon is None else round(horizon * 1e9), report)
         self._batches = self._all()
 
@@ -167,6 +164,12 @@ class Table:
     def close(self) -> None:
         """Close the file that is open."""
         self._batches.close()
+
+
+def mapped(channels: Sequence[Channel], width: int, report: Report) -> tuple[list[Any], ChannelMapping]:
+    """Return the columns that feed channels, and what makes events of their values."""
+    columns = list(dict.fromkeys(name for channel in channels for name in channel.needed))
+    return columns, ChannelMapping([(channels, columns, [*map(heading_unit, columns)])], width=width, report=report)
 
 
 def _selectors(

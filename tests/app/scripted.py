@@ -61,12 +61,6 @@ def random_walk(n, seed=1, step=0.1):
     return np.arange(1, n + 1) * 0.1, 40 + np.cumsum(rng.normal(size=n)) * step + rng.normal(size=n)
 
 
-def black_box(f):
-    """The motor's winding with a step that is a black box."""
-    sensors = tuple(replace(sensor, h=lambda X, u, p: X[:, :1], H=None) for sensor in MODEL.sensors)
-    return replace(MODEL, f=f, F=None, linear=False, sensors=sensors, black_box=True)
-
-
 def twin(history=200_000, horizon=2.0, tick=1000.0, model=MODEL, estimator="kf"):
     time = SimpleNamespace(horizon=horizon, degraded_after=5.0, stale_after=30.0, tick=tick)
     parts = {

@@ -247,16 +247,6 @@ def case(nx: int, nu: int, seed: int) -> tuple[Matrices, Log, JointGaussian]:
     return matrices, log, JointGaussian(matrices, log)
 
 
-def kalman(mean: np.ndarray, P: np.ndarray, H: np.ndarray, offset: np.ndarray, R: np.ndarray, y: np.ndarray) -> Any:
-    """Mean and covariance of N(mean, P) given y = H x + offset + v, the NIS, the log-likelihood and S."""
-    S = H @ P @ H.T + R
-    K = P @ H.T @ np.linalg.inv(S)
-    nu = y - H @ mean - offset
-    nis = nu @ np.linalg.solve(S, nu)
-    log_likelihood = -0.5 * (nis + np.linalg.slogdet(S)[1] + nu.size * np.log(2 * np.pi))
-    return mean + K @ nu, P - K @ S @ K.T, nis, log_likelihood, S
-
-
 def assert_mean(runs: Sequence[Any], exact: Any, bias: Any = 0.0) -> None:
     """The mean of what runs found is right to five of its own standard errors, but for a bias."""
     error = np.std(runs, axis=0, ddof=1) / np.sqrt(len(runs))
