@@ -483,8 +483,8 @@ def test_a_black_box_that_fails_loses_nothing_and_is_reported_once():
     np.testing.assert_array_equal(pull.track.mean[kept], expected.mean)
     np.testing.assert_array_equal(pull.track.std[kept], expected.std)
     (text,) = [text for text in stepped.notices() if "solver" in text]
-    line = Solver.f.__code__.co_firstlineno + 2
-    assert f"test_engine.py:{line}: model motor_winding: f fails on a block of 5 states: RuntimeError: the" in text
+    line = box.f.__code__.co_firstlineno + 1
+    assert f"scripted.py:{line}: model motor_winding: f fails on a block of 5 states: RuntimeError: the" in text
     assert "return NaN in the rows" in text and "count as failed" in text
 
 
