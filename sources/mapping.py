@@ -342,7 +342,7 @@ class ChannelMapping:
 
     def _place(self, batch: Events, channel: Channel) -> None:
         """Convert latitude and longitude to east and north in place; the first valid fix is the default origin."""
-        rows = np.flatnonzero((batch.kind == READING) & (batch.channel == channel.index))
+        rows = batch.of_sensor(channel.index)
         if not rows.size:
             return
         fixes = batch.value[rows, :2]

@@ -122,8 +122,7 @@ class ModbusSource:
                 self._poll()
             except Exception as error:  # noqa: BLE001  no device may end the source
                 why = printable(str(error) or type(error).__name__)
-                text = f"no measurements from the device at {self._place}: {why}; it is tried again"
-                self._report(NO_BROKER, text)
+                self._report(NO_BROKER, f"no measurements from the device at {self._place}: {why}; it is tried again")
             self.connected.clear()
             self._client.close()
             self._stopping.wait(RETRY_S)

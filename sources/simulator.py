@@ -13,6 +13,7 @@ from estimators.errors import NisusError, SourceError, nearest
 from estimators.log import INPUT, READING, TICK, TRUTH, Events
 from estimators.model.state_space import StateSpaceModel
 from estimators.numerics.jit import plain
+from estimators.numerics.linalg import wrapped
 
 from .faults.kinds import NEVER_NS, Change
 
@@ -109,7 +110,6 @@ class Simulator:
             None if sensor.correlation is None else factor(np.array(sensor.correlation)) for sensor in model.sensors
         ]
         self._reported = [0] * len(self._plans)
-        self._circular = np.flatnonzero(truth.circular)
         self._rng = np.random.default_rng(seed)
         self._factor: tuple[bytes, np.ndarray] | None = None
         self._shown_runs = _runs(model.shown, model.width)
@@ -171,8 +171,7 @@ class Simulator:
             truth.f(self._x, self._u, self._p, self._step / pieces, after)
             self._x = after
         self._x = self._x + self._noise()
-        for j in self._circular:
-            self._x[j] = (self._x[j] + np.pi) % (2.0 * np.pi) - np.pi
+        self._x = wrapped(self._x, truth.model.circular)
         u = self._inputs(self._k * self._step)
         if not np.array_equal(u, self._u):
             rows.append((t, INPUT, 0, u))

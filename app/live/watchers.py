@@ -13,7 +13,7 @@ import numpy as np
 from estimators.diagnostics.clock_fit import ClockFit, LeastDelays
 from estimators.diagnostics.detectors import detector_of
 from estimators.diagnostics.episodes import Episode, TrackedEpisode
-from estimators.diagnostics.repeats import HELD, UNDECIDED, find_repeats, sensor_rows
+from estimators.diagnostics.repeats import HELD, RECENT, UNDECIDED, latest_repeats, sensor_rows
 from estimators.log import INPUT, READING, Events
 from estimators.track import STALE, TRACKING, WAITING
 from sources.source import LOST_FRAMES, Source, controls_of, is_utc
@@ -239,12 +239,6 @@ REPEATS_PERIOD_S, REPEATS_CPU_SHARE = 5.0, 0.01
 REPEATS_OVER = 4
 """Searches in a row that find none, after which an episode is over: coarse values hide repeats now and then."""
 
-REPEATS_EVENTS = 51_200
-"""Latest events of the log that are searched."""
-
-REPEATS_VALUES = (200, 800, 3200, 12_800, REPEATS_EVENTS)
-"""Latest values of a row that are searched: a hold is found once it has 15 new values in one of these."""
-
 
 class RepeatedValues:
     """Episodes in which the rows of a sensor of a live source are repeats, of which each new value is held."""
@@ -259,7 +253,7 @@ class RepeatedValues:
         """Search the last values of each sensor row; return the seconds to the next time."""
         if not self._engine.source.live:
             return math.inf
-        begun, taken = time.thread_time(), self._engine.last_events(REPEATS_EVENTS)
+        begun, taken = time.thread_time(), self._engine.last_events(RECENT[-1])
         events = Events.empty(1) if taken is None else taken.events
         for _, row, column, known in sensor_rows(self._engine.model, events):
             job.check()
@@ -267,15 +261,13 @@ class RepeatedValues:
         return max(REPEATS_PERIOD_S, (time.thread_time() - begun) / REPEATS_CPU_SHARE)
 
     def _judge(self, row: str, t: np.ndarray, values: np.ndarray) -> None:
-        found = {n: find_repeats(t[-n:], values[-n:]) for n in REPEATS_VALUES if n < 4 * t.size}
-        held = next(((float(t[-n:][0]) * 1e-9, one) for n, one in found.items() if one.kind == HELD), None)
-        if held is not None:
-            begun, one = held
+        begun, one = latest_repeats(t, values)
+        if one.kind == HELD:
             text = detector_of("repeating").text(SimpleNamespace(name=row, repeats=one))
-            episode = Episode(begun, None, row, "repeating", one.share, math.nan, math.nan, "", text)
+            episode = Episode(begun * 1e-9, None, row, "repeating", one.share, math.nan, math.nan, "", text)
             _begin(self.entries, int(t[-1]), episode)
             self._since[row] = 0
-        elif any(one.kind != UNDECIDED for one in found.values()):
+        elif one.kind != UNDECIDED:
             self._since[row] += 1
             if self._since[row] >= REPEATS_OVER:
                 _end(self.entries, int(t[-1]), "repeating", row)

@@ -14,7 +14,6 @@ from estimators.diagnostics.episodes.baseline import Normal, commission, contrad
 from estimators.diagnostics.score import score
 from estimators.errors import ConfigError
 from estimators.fold import Fold
-from estimators.log import READING
 from estimators.track import DIVERGED, FAILED, GATED, SCREENED, STALE
 from estimators.tuning import CHANGED_MARK
 
@@ -87,7 +86,7 @@ def against(fold: Fold) -> str:
     if lost > MAX_FAULTY_SHARE:
         return f"the twin is diverged or stale for {100 * lost:.0f} % of its rows"
     for s, sensor in enumerate(model.sensors):
-        rows = np.flatnonzero((log.kind[: fold.n] == READING) & (log.channel[: fold.n] == s))
+        rows = log.events.select(slice(0, fold.n)).of_sensor(s)
         if not rows.size:
             continue
         refused = float(np.mean(np.isin(track.verdict[rows], (GATED, FAILED, SCREENED))))

@@ -85,7 +85,7 @@ class Plan:
             if not isinstance(events, Events):
                 continue
             for sensor in self.fed:
-                t = np.unique(events.t[(events.kind == READING) & (events.channel == sensor)])
+                t = np.unique(events.t[events.of_sensor(sensor)])
                 if t.size > 2:
                     slowest = max(slowest or 0.0, float(np.median(np.diff(t))) * 1e-9)
         return slowest

@@ -70,6 +70,20 @@ class Finding(NamedTuple):
         return "changes" if self.kind in (STEPS, DEAD_BAND) else ""
 
 
+RECENT = (200, 800, 3200, 12_800, 51_200)
+"""Latest values that are searched: a hold is found once it has `MIN_CHANGES` new values in one of these."""
+
+
+def latest_repeats(t: np.ndarray, values: np.ndarray) -> tuple[int, Finding]:
+    """Return the first time (ns) of the latest values of a channel, and whether these are repeats, as `find_repeats`.
+
+    They are HELD if any number of them in `RECENT` is, and undecided only if all are.
+    """
+    found = [(int(t[-n:][0]), find_repeats(t[-n:], values[-n:])) for n in RECENT if n < 4 * t.size]
+    order = [HELD, SINGLE, STEPS, DEAD_BAND, LINEAR, UNDECIDED]
+    return min(found, key=lambda item: order.index(item[1].kind), default=(0, Finding(UNDECIDED)))
+
+
 def sensor_rows(model: StateSpaceModel, events: Events) -> Iterator[tuple[str, str, int, np.ndarray]]:
     """Yield sensor, row, its column and the mask (N,) of its measurements, for each sensor row."""
     for k, sensor in enumerate(model.sensors):

@@ -64,14 +64,14 @@ def read_messages(path: Path, wanted: frozenset[int] | None, longest: int) -> It
     if isinstance(reader, can.BLFReader):
         reader.__class__ = BlfBlocks
     lines = _Lines(reader.file) if isinstance(getattr(reader, "file", None), TextIOWrapper) else None
-    if lines is not None:
+    if lines:
         reader.file = lines
     seen: Counter[tuple[BusName, int]] = Counter()
     buses: dict[BusName, int] = {}
     count = errors = broken = 0
     fault = ""
     try:
-        messages = iter(reader) if lines is None else _by_lines(path, reader, lines)
+        messages = _by_lines(path, reader, lines) if lines else iter(reader)
         size = FIRST_CHUNK_FRAMES
         while True:
             chunk: list[Any] = []
@@ -101,7 +101,7 @@ def read_messages(path: Path, wanted: frozenset[int] | None, longest: int) -> It
             size = CHUNK_FRAMES
         if bad := getattr(reader, "bad", ()):
             fault = refused("", len(bad), "block", *bad[0])
-        fault = fault or (lines.fault if lines is not None else "") or warned.fault or _missing_end(path, reader)
+        fault = fault or getattr(lines, "fault", "") or warned.fault or _missing_end(path, reader)
         if broken:
             fault = fault or f"{broken} frames hold no numbers"
     finally:
@@ -288,16 +288,15 @@ def _columns(
         places.append(buses.setdefault(bus, len(buses)))
         length.append(len(data))
         chunks.append(data.ljust(longest, b"\0"))
-    raw = Raw(
-        np.array(t, np.int64),
-        np.array(keys, np.int64),
-        np.array(places, np.int64),
-        np.array(length, np.int64),
-        np.frombuffer(bytearray().join(chunks), np.uint8).reshape(len(chunks), longest),
-        tuple(buses),
-        len(messages),
-    )
-    return raw, broken
+    numbers = (np.array(column, np.int64) for column in (t, keys, places, length))
+    return Raw._make(
+        (
+            *numbers,
+            np.frombuffer(bytearray().join(chunks), np.uint8).reshape(len(chunks), longest),
+            tuple(buses),
+            len(messages),
+        )
+    ), broken
 
 
 def _selected(

@@ -166,7 +166,7 @@ class Table:
         self._batches.close()
 
 
-def mapped(channels: Sequence[Channel], width: int, report: Report) -> tuple[list[Any], ChannelMapping]:
+def mapped(channels: Sequence[Channel], width: int, report: Report) -> tuple[list[str | TextMatch], ChannelMapping]:
     """Return the columns that feed channels, and what makes events of their values."""
     columns = list(dict.fromkeys(name for channel in channels for name in channel.needed))
     return columns, ChannelMapping([(channels, columns, [*map(heading_unit, columns)])], width=width, report=report)

@@ -14,7 +14,7 @@ from typing import NamedTuple
 import numpy as np
 
 from estimators.diagnostics.field_pictures import Picture, plane_shape, reduction
-from estimators.log import READING, Events
+from estimators.log import Events
 from estimators.model.parts import Field
 from estimators.model.state_space import StateSpaceModel
 from estimators.track import HEALTH_NAMES, Track
@@ -241,7 +241,7 @@ def take_innovations(normalised: np.ndarray, which: np.ndarray, events: Events, 
     """
     found = False
     for k in np.unique(which[:, 0]):
-        mine = np.flatnonzero((events.kind == READING) & (events.channel == k))
+        mine = events.of_sensor(k)
         if mine.size:
             of = which[:, 0] == k
             with np.errstate(invalid="ignore", divide="ignore"):

@@ -9,6 +9,7 @@ from typing import Protocol
 import numpy as np
 
 from estimators.log import READING
+from estimators.numerics.linalg import wrapped
 from estimators.track import estimated_rows
 
 from ...live.outputs import Cursor, Pull
@@ -205,7 +206,5 @@ def less(pull: Pull, engine: Running) -> Pull:
         # The log may have begun again: a row of the same number at another time is another.
         same = (live.events.t == pull.events.t[rows]) & estimated_rows(live.track)
         mean[rows] = np.where(same[:, None], pull.track.mean[rows] - live.track.mean, np.nan)
-    for j, state in enumerate(engine.model.shown_states):
-        if state.circular:
-            mean[:, j] = (mean[:, j] + np.pi) % (2.0 * np.pi) - np.pi
+    mean = wrapped(mean, [state.circular for state in engine.model.shown_states])
     return replace(pull, track=pull.track._replace(mean=mean))

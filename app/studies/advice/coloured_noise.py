@@ -20,7 +20,7 @@ from estimators.fit.entries import entries_of
 from estimators.fit.objective import Cancelled, Objective, scaled_rounds
 from estimators.fit.recording import Recording, without_queries
 from estimators.fold import Fold
-from estimators.log import READING, Log
+from estimators.log import Log
 from estimators.model.coloured import ColouredError, coloured, disturbance_time, error_time, errors_of
 from estimators.model.state_space import StateSpaceModel
 from estimators.tuning import Tuning
@@ -142,7 +142,7 @@ def _candidates(model: StateSpaceModel, estimator: str, trial: _Trial, row: Cali
     fold = trial.fold
     index = fold.model.row_names.index(row.subject)
     k = int(np.searchsorted(fold.model.row_start, index, side="right")) - 1
-    rows = np.flatnonzero((fold.log.kind[: fold.n] == READING) & (fold.log.channel[: fold.n] == k))
+    rows = fold.log.events.select(slice(0, fold.n)).of_sensor(k)
     column = index - int(fold.model.row_start[k])
     innovation = fold.track.innovation[rows, column]
     period = float(np.median(np.diff(fold.log.t[rows]))) * 1e-9

@@ -24,6 +24,7 @@ from estimators.diagnostics.sensitivity.responses import DETERMINISTIC_FILTERS, 
 from estimators.diagnostics.sensitivity.visibility import fault_tests
 from estimators.fold import Fold
 from estimators.log import READING
+from estimators.numerics.linalg import wrapped
 
 from ...twin.twin import Twin
 from .scenario import (
@@ -169,10 +170,8 @@ def _seen(bench: Bench, clean: Fold, wrong: Fold, mistake: Mistake) -> tuple[boo
     during = (clean.log.t[own] >= start) & (clean.log.t[own] < end)
     moved = np.where(during[:, None], wrong.track.innovation[other] - clean.track.innovation[own], 0.0)
     for s, sensor in enumerate(model.sensors):
-        for k, row in enumerate(sensor.rows):
-            if row.circular:
-                mine = clean.log.channel[own] == s
-                moved[mine, k] = (moved[mine, k] + np.pi) % (2.0 * np.pi) - np.pi
+        mine, rows = clean.log.channel[own] == s, slice(0, len(sensor.rows))
+        moved[mine, rows] = wrapped(moved[mine, rows], [row.circular for row in sensor.rows])
     standardised = np.full_like(clean.track.innovation, np.nan)
     # The bank knows S of the fold that is wrong.
     standardised[own] = moved / wrong.track.innovation_std[other]
