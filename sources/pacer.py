@@ -94,26 +94,23 @@ class Pacer:
         self._playhead = self._position()
         self._anchor = self._clock()
 
-    def pause(self) -> None:
-        """Pause the playhead."""
+    def _set(self, name: str, value: float) -> None:
         with self._changed:
             self._settle()
-            self.paused = True
+            setattr(self, name, value)
             self._changed.notify_all()
+
+    def pause(self) -> None:
+        """Pause the playhead."""
+        self._set("paused", True)
 
     def resume(self) -> None:
         """Resume the playhead."""
-        with self._changed:
-            self._settle()
-            self.paused = False
-            self._changed.notify_all()
+        self._set("paused", False)
 
     def set_speed(self, speed: float) -> None:
         """Play `speed` times real time from here on."""
-        with self._changed:
-            self._settle()
-            self.speed = speed
-            self._changed.notify_all()
+        self._set("speed", speed)
 
     def step(self) -> None:
         """Release the events of the next time at which there are any, and move the playhead there."""

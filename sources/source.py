@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Generator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Any, NamedTuple, Protocol, cast, runtime_checkable
 
@@ -97,6 +97,27 @@ class Acknowledging(Marked, Protocol):
 
     def acknowledge(self) -> None:
         """Acknowledge all that was read: it has been stored; in the thread that reads."""
+
+
+class Recorded:
+    """What sources of recordings share: their events are those of a generator."""
+
+    live = False
+    _batches: Generator[Events, None, None]
+    _timeout = 0.0
+
+    def read(self, timeout: float) -> Events | None:
+        """Return the next events; none if there are none within `timeout` seconds; None at the end."""
+        self._timeout = timeout
+        return next(self._batches, None)
+
+    def now(self) -> int | None:
+        """Return None: a recording has no clock."""
+        return None
+
+    def close(self) -> None:
+        """Close the open file."""
+        self._batches.close()
 
 
 def span_of(source: Source) -> tuple[int, int] | None:

@@ -38,7 +38,11 @@ MIN_EXACT = 0.9  # Share of the runs of coarse values within such a deviation, a
 MAX_MULTIPLE = 20.0  # Periods of the longest run that is looked at
 MAX_HELD = 0.99  # Share of the holds of one period within the longest one
 MAX_CANDIDATES = 5  # Commonest run lengths that are tried as a period
-MIN_Z, MIN_HELD = 7.0, 0.98  # Of coarse lines: z of the phase of their knots, and share of the rows on their chords
+MIN_Z, MIN_HELD, MAX_BETWEEN = (
+    7.0,
+    0.98,
+    0.9,
+)  # Of coarse lines: z of the phase of their knots, share of the rows on their chords, and on others
 MAX_APART, MAX_RANKED = 100, 30_000  # Rows between such knots, and rows in which they are searched
 
 
@@ -284,9 +288,13 @@ def _knots_apart(values: np.ndarray, d: np.ndarray, e: np.ndarray, tolerance: fl
     if not found or np.unique(values).size <= MAX_LEVELS or _has_pattern(np.diff(d)):
         return 0
     for _, rows, first in found:
-        knots = np.arange(first + 1, values.size, rows)
-        within = slice(knots[0], knots[-1] + 1)
-        chord = np.interp(np.arange(values.size)[within], knots, values[knots])
-        if np.mean(np.abs(values[within] - chord) <= tolerance * (1.0 + 1e-6)) >= MIN_HELD:
+        held = []
+        # Chords between the middles miss the knots, but for a ramp, of which any chord holds all rows.
+        for at in (first, first + rows // 2):
+            knots = np.arange(at + 1, values.size, rows)
+            within = slice(knots[0], knots[-1] + 1)
+            chord = np.interp(np.arange(values.size)[within], knots, values[knots])
+            held.append(float(np.mean(np.abs(values[within] - chord) <= tolerance * (1.0 + 1e-6))))
+        if held[0] >= MIN_HELD and held[1] < MAX_BETWEEN:
             return rows
     return 0

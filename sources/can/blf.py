@@ -19,7 +19,7 @@ from can.io.blf import LOG_CONTAINER, LOG_CONTAINER_STRUCT, NO_COMPRESSION, OBJ_
 from ..units import to_ns
 
 KEY_BITS, REMOTE_FLAG = 0x9FFFFFFF, 0x80  # The highest bit of an id is that of an extended frame, as in `EXTENDED`.
-CAN_MESSAGE, CAN_MESSAGE2 = 1, 86
+CAN_MESSAGE, CAN_MESSAGE2, RESTORE_POINT = 1, 86, 115
 SLOW_TYPES = (73, 100, 101)  # Error frames and CAN FD, left to python-can
 HEAD, MARK = OBJ_HEADER_BASE_STRUCT, b"LOBJ"  # Begin of an object
 BLOCK = re.compile(MARK + b".{8}" + LOG_CONTAINER.to_bytes(4, "little"), re.DOTALL)  # Begin of a compressed one
@@ -55,7 +55,14 @@ class BlfBlocks(can.BLFReader):
                 if kind == LOG_CONTAINER:
                     packed = LOG_CONTAINER_STRUCT.unpack_from(content)[0] != NO_COMPRESSION
                     content = content[LOG_CONTAINER_STRUCT.size :]
-                    yield from self._parse_container(zlib.decompressobj().decompress(content) if packed else content)
+                    if packed:
+                        inflated = zlib.decompressobj()
+                        content = inflated.decompress(content)
+                        if not inflated.eof and self.file.tell() >= place + size:
+                            raise ValueError("it cannot be decompressed")
+                    yield from self._parse_container(content)
+                elif kind != RESTORE_POINT:
+                    raise ValueError(f"objects of type {kind} are not known here")
                 if self.file.tell() == place + size + size % 4:
                     continue
             except Exception as wrong:  # noqa: BLE001  a damaged file makes python-can raise anything

@@ -15,7 +15,7 @@ from estimators.errors import SourceError
 from estimators.log import Events
 
 from ..formats import CAN_LOGS, check_present, is_compressed, suffix_of
-from ..source import NEVER, TRUNCATED, Report, ignore
+from ..source import NEVER, TRUNCATED, Recorded, Report, ignore
 from ..units import second_ns
 from ..worker_process import IsolatedReader, read_isolated
 from .decoder import Decoder
@@ -23,7 +23,7 @@ from .mf4 import mf4_span, read_mf4
 from .readers import BusName, LogSummary, Raw, open_reader, read_messages, unreadable
 
 
-class CanLog:
+class CanLog(Recorded):
     """Source of recorded CAN logs: files read one after the other, as one log.
 
     Args:
@@ -34,8 +34,6 @@ class CanLog:
     Raises:
         SourceError: If a file is missing, empty, or of no known format.
     """
-
-    live = False
 
     def __init__(self, files: Sequence[str | os.PathLike[str]], decoder: Decoder, *, report: Report = ignore) -> None:
         self._files = [Path(file) for file in files]
@@ -50,7 +48,6 @@ class CanLog:
         self.frames = 0
         """Frames read so far, wanted or not."""
         self._seen: Counter[tuple[BusName, int]] = Counter()
-        self._timeout = 0.0
         self._batches = self._all()
 
     @cached_property
@@ -95,19 +92,6 @@ class CanLog:
         if fault or not count:
             fault = fault or "it holds none"
             self._report(TRUNCATED, f"{path.name}: the file is damaged ({fault}); {count} frames were read")
-
-    def read(self, timeout: float) -> Events | None:
-        """Return the events of the next frames; none if none come within `timeout` seconds; None at the end."""
-        self._timeout = timeout
-        return next(self._batches, None)
-
-    def now(self) -> int | None:
-        """Return None: a recording has no clock."""
-        return None
-
-    def close(self) -> None:
-        """Close the open file."""
-        self._batches.close()
 
 
 def frames_reader(path: Path, wanted: frozenset[int] | None, longest: int) -> IsolatedReader:

@@ -14,7 +14,7 @@ from estimators.log import Events
 
 from ..formats import check_present, suffix_of
 from ..mapping import ABSENT, PRESENT, ChannelMapping
-from ..source import NEVER, TRUNCATED, UNASSIGNED, Channel, Report, ignore
+from ..source import NEVER, TRUNCATED, UNASSIGNED, Channel, Recorded, Report, ignore
 from ..units import heading_unit
 from .order import Order
 from .rows import TableRows, names_of, rows_of
@@ -24,7 +24,7 @@ from .times import SERIAL_DAYS, UNITS, TimeColumn
 BATCH_EVENTS = 4096  # Events that are returned at once
 
 
-class Table:
+class Table(Recorded):
     """Reads tables of the same columns one after the other, as one recording.
 
     A row gives an event for its inputs, then its readings, then its true values. An empty cell (null in Parquet) is
@@ -48,8 +48,6 @@ class Table:
     Raises:
         SourceError: If a file or column is missing, or a unit does not convert.
     """
-
-    live = False
 
     def __init__(
         self,
@@ -84,7 +82,6 @@ class Table:
         self._selectors = _selectors(channels, self._columns)
         self._valued: set[str | TextMatch] = set()
         self._count = 0
-        self._timeout = 0.0
         self._order = Order(self._time.label, time_unit, None if horizon is None else round(horizon * 1e9), report)
         self._batches = self._all()
 
@@ -148,22 +145,9 @@ class Table:
             return f"{files}: column {name.column!r} is never {wanted} in {self._count} rows, so {fed} has no values"
         return f"{files}: column {name!r} has no value in {self._count} rows, so {fed} has no values"
 
-    def read(self, timeout: float) -> Events | None:
-        """Return the events of the next rows; none if there are none within `timeout` seconds; None at the end."""
-        self._timeout = timeout
-        return next(self._batches, None)
-
     def first(self) -> Events | None:
         """Return the events of the first rows as they were recorded, in place of `read`; None if there are none."""
         return next((batch for path in self._files for batch in self._one(path) if len(batch)), None)
-
-    def now(self) -> int | None:
-        """Return None: a recording has no clock."""
-        return None
-
-    def close(self) -> None:
-        """Close the file that is open."""
-        self._batches.close()
 
 
 def mapped(channels: Sequence[Channel], width: int, report: Report) -> tuple[list[str | TextMatch], ChannelMapping]:

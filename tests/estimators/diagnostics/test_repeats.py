@@ -60,6 +60,7 @@ def test_no_measurement_is_taken_for_a_repeat(step: float):
             "sine": np.round(10.0 * np.sin(rows / 9.1) / max(step, 0.01)) * max(step, 0.01),
             "stops": np.round(10.0 * np.sin(moves / 13.7) / max(step, 0.01)) * max(step, 0.01),
             "ramp": np.floor(rows / 17.0),
+            "noisy ramp": np.floor(rows / 50.0 + rng.normal(0.0, 0.03, 3000)),
             "toggle": np.floor(rows / 10.0) % 2,
             "smooth": smooth(rng, step),
             "spikes": np.where(rng.uniform(size=3000) < 0.02, 50.0, np.round(rng.normal(0.0, 0.1, 3000))),
