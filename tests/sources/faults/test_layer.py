@@ -211,7 +211,7 @@ def test_pause_step_and_seek_go_through_to_the_pacer():
     assert source.span == (START * SECOND, (START + N - 1) * SECOND) and source.inner.speed == 1.0
     assert due(source) == [(0.0, 0.0)]
     source.inner.pause()
-    clock.advance(5)
+    clock.wait(5)
     assert source.inner.paused and due(source) == []
     source.inner.step()
     assert due(source) == [(1.0, 0.1)]
@@ -245,9 +245,9 @@ def test_an_injected_fault_comes_again_where_it_came_when_the_replay_is_sought_b
 def test_a_delay_in_a_replay_comes_late_by_the_replays_own_time():
     source, _, clock = paced(Fault("delay", FIRST, size=0.5, start=1, end=3), speed=2.0)
     due(source)
-    clock.advance(0.5)  # one second of the replay
+    clock.wait(0.5)  # one second of the replay
     assert due(source) == []
-    clock.advance(0.25)
+    clock.wait(0.25)
     assert due(source) == [(1.0, 0.1)]
 
 
@@ -258,7 +258,7 @@ def test_the_stamps_and_order_of_a_replay_are_those_of_a_fold():
     got = []
     while (batch := source.read(0.0)) is not None:
         got.append(batch)
-        clock.advance(0.3)
+        clock.wait(0.3)
     assert_same(whole, Events.concat(got, MODEL.width))
 
 
@@ -337,7 +337,7 @@ def test_a_model_change_that_is_injected_is_stamped_where_it_holds_and_ends_with
     got = []
 
     def play(seconds):
-        clock.advance(seconds)
+        clock.wait(seconds)
         while (batch := source.read(0.0)) is not None and len(batch):
             got.append(batch)
 
