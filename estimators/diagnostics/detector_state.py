@@ -71,22 +71,25 @@ def detector_context(
         expected: Sensors that must report, (sensors,); None for those that have reported.
 
     Returns:
-        `baseline` (rows, 3 + TESTS); `normal` (sensors, 3), see `normal_nis`; `ranges` (shown + inputs, 3), in which
-        the model was fitted, and whether bands widen outside; `fitted`, 1 if there is any; `expected` (sensors,);
+        `baseline` (rows, 3 + TESTS); `normal` (sensors, 3), see `normal_nis`; `ranges` (shown + inputs, 5), in which
+        the model was fitted, whether bands widen outside, and physical limits; `fitted`, 1 if there is any; `expected`
+        (sensors,);
         `chances` (2,), log Λ of a rejected and of an accepted measurement; `gated`, whether outliers are rejected;
         `marginal`; `n_tests` in all.
     """
-    ranges = np.full((len(model.shown) + model.nu, 3), [-np.inf, np.inf, 0.0])
+    ranges = np.full((len(model.shown) + model.nu, 5), [-np.inf, np.inf, 0.0, -np.inf, np.inf])
+    for k, state in enumerate(model.shown_states):
+        ranges[k, 3:] = state.limits or ranges[k, 3:]
     fitted = [(item.fitted, item.widens) for item in model.shown_states]
     for k, (limits, widens) in enumerate(fitted + [(item.fitted, item.widens) for item in model.inputs]):
         if limits is not None:
-            ranges[k] = *limits, widens
+            ranges[k, :3] = *limits, widens
     counts = np.array([len(sensor.rows) for sensor in model.sensors], np.int64)
     return {
         "baseline": np.ascontiguousarray(baseline, float),
         "normal": normal_nis(model, baseline),
         "ranges": ranges,
-        "fitted": int(np.any(np.isfinite(ranges[:, :2]))),
+        "fitted": int(np.any(np.isfinite(ranges[:, [0, 1, 3, 4]]))),
         "expected": np.zeros(len(counts), np.int64) if expected is None else np.ascontiguousarray(expected, np.int64),
         "chances": gate_log_ratios(gate),
         "gated": int(gate is not None),

@@ -52,6 +52,7 @@ from .detectors import (
     AGREEING,
     AT_REFUSALS,
     DISAGREEING,
+    IMPOSSIBLE,
     IMPOVERISHED,
     LOST,
     OUTSIDE,
@@ -61,6 +62,7 @@ from .detectors import (
     STUCK,
     TESTS,
 )
+from .references import HALF_WIDTH
 
 MIN_PARTICLES = 4.0
 """Effective sample size below which particles are poor; they also are if all descend from one particle."""
@@ -164,17 +166,19 @@ def _count_particles(effective, ancestors, state):
 
 @embedded
 def _range(i, u, context, track):
-    """Return the flag of a state or an input outside the range in which the model was fitted, 0 if there is none."""
+    """Return the flags of states and inputs outside the range in which the model was fitted, or beyond all limits."""
     states = track.mean.shape[1]
-    ranges = floats(context.ranges, 3 * (states + u.size))
+    ranges = floats(context.ranges, 5 * (states + u.size))
     found = 0
     for k in range(states + u.size):
         value = track.mean[i, k] if k < states else u[k - states]
-        if value < ranges[3 * k] or value > ranges[3 * k + 1]:
-            if ranges[3 * k + 2] == 0.0:
-                return OUTSIDE
-            found = OUTSIDE_WIDENED
-    return found
+        own = ranges[5 * k : 5 * k + 5]
+        if value < own[0] or value > own[1]:
+            found |= OUTSIDE if own[2] == 0.0 else OUTSIDE_WIDENED
+        half = HALF_WIDTH * track.std[i, k] if k < states else 0.0
+        if value + half < own[3] or value - half > own[4]:
+            found |= IMPOSSIBLE
+    return found & ~OUTSIDE_WIDENED if found & OUTSIDE != 0 else found
 
 
 @embedded

@@ -269,6 +269,13 @@ DETECTORS = (
         effect="the value",
     ),
     Detector(
+        "impossible",
+        "{0.name} is {0.size:.4g}{0.spaced_unit}, and its band lies beyond {0.limits}, {0.since}",
+        "a sensor has an offset or a wrong scale, or the model is wrong: `nisus check` compares them",
+        statistic="band of a state beside its physical limits",
+        effect="the value",
+    ),
+    Detector(
         "impoverished",
         "the particle cloud is impoverished {0.since}: {0.size:.3g} effective particles, all from {0.ancestors}",
         "use more particles, pf-ekf or pf-reg, or increase Q of the states that hardly move",
@@ -342,7 +349,7 @@ ADVISORY_ALARM = 1 << 30
 LOST = sum(detector.bits for detector in DETECTORS if detector.sensor_lost)
 """Alarms during which a sensor carries no information on the asset."""
 
-IMPOVERISHED, OUTSIDE, OUTSIDE_WIDENED = 1 << 59, 1 << 60, 1 << 61
+IMPOVERISHED, OUTSIDE, OUTSIDE_WIDENED, IMPOSSIBLE = 1 << 59, 1 << 60, 1 << 61, 1 << 62
 """Bits of `Track.flags` above those of the sensors that dropped out: few particles carry the estimate; outside the
 range in which the model was fitted; the same where the bands widen there."""
 

@@ -8,7 +8,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from ..diagnostics.detector_state import JOINT_MASK, MASK, ROW, SENSOR, TWIN
-from ..diagnostics.detectors import DETECTORS, OUTSIDE, OUTSIDE_WIDENED, SENSOR_FLAGS, detector_of
+from ..diagnostics.detectors import DETECTORS, IMPOSSIBLE, OUTSIDE, OUTSIDE_WIDENED, SENSOR_FLAGS, detector_of
 from ..model.state_space import StateSpaceModel
 from ..track import DEGRADED, DIVERGED, HEALTH_NAMES, STALE
 
@@ -72,6 +72,7 @@ def _cause(mask: int, flags: int, health: int) -> str:
     causes = [detector.name for detector in DETECTORS if detector.bits & mask]
     causes += ["silent"] if flags & SENSOR_MASK else []
     causes += ["outside"] if flags & (OUTSIDE | OUTSIDE_WIDENED) else []
+    causes += ["impossible"] if flags & IMPOSSIBLE else []
     causes += [HEALTH_NAMES[health]] if health in (STALE, DIVERGED) else []
     if health == DEGRADED and not any(detector_of(name).grade == HEALTH_NAMES[DEGRADED] for name in causes):
         causes.append("silent")  # for `degraded_after`, of sensors that have no period, or need not report

@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 
-from ..diagnostics.detectors import ALARM_NAMES, IMPOVERISHED, OUTSIDE, OUTSIDE_WIDENED, SENSOR_FLAGS
+from ..diagnostics.detectors import ALARM_NAMES, IMPOSSIBLE, IMPOVERISHED, OUTSIDE, OUTSIDE_WIDENED, SENSOR_FLAGS
 from ..diagnostics.episodes import Episode, episode_json
 from ..diagnostics.references import withheld
 from ..events.batch import KIND_NAMES, READING, Events, truth_of
@@ -90,7 +90,12 @@ def table_of(
 
 
 _CAUSES = {1 << k: cause for k, cause in enumerate(ALARM_NAMES)}
-_FLAGS = {IMPOVERISHED: "impoverished", OUTSIDE: "outside the fitted range", OUTSIDE_WIDENED: "outside, bands widen"}
+_FLAGS = {
+    IMPOVERISHED: "impoverished",
+    OUTSIDE: "outside the fitted range",
+    OUTSIDE_WIDENED: "outside, bands widen",
+    IMPOSSIBLE: "impossible",
+}
 
 
 def _words(masks: np.ndarray, bits: dict[int, str]) -> np.ndarray:

@@ -10,6 +10,7 @@ from ...log import INPUT
 from ...model.state_space import Input, State
 from ...track import DIVERGED, GATED, HEALTH_NAMES, SCREENED, STALE, WAITING
 from ..detectors import (
+    IMPOSSIBLE,
     IMPOVERISHED,
     OUTSIDE,
     OUTSIDE_WIDENED,
@@ -21,6 +22,7 @@ from ..detectors import (
     detector_of,
 )
 from ..health import HealthPolicy
+from ..references import HALF_WIDTH
 from .episode import JOINED, AlarmRun, Episode, FoundEpisode, JudgedRows, runs
 from .wording import SensorFacts, TwinFacts
 
@@ -81,35 +83,48 @@ def left_ranges(judged: JudgedRows) -> Iterator[FoundEpisode]:
     """Yield shown states and inputs outside the range in which the model was fitted."""
     events, model, track = judged.events, judged.model, judged.track
     t = events.t
-    if not np.any(track.flags & (OUTSIDE | OUTSIDE_WIDENED)):
+    if not np.any(track.flags & (OUTSIDE | OUTSIDE_WIDENED | IMPOSSIBLE)):
         return
     for column, state in enumerate(model.shown_states):
-        yield from _outside(state, track.mean[:, column], t)
+        mean, half = track.mean[:, column], HALF_WIDTH * track.std[:, column]
+        yield from _outside(state, "outside", state.fitted, mean, mean, t)
+        yield from _outside(state, "impossible", state.limits, mean + half, mean - half, t)
     rows = np.flatnonzero(events.kind == INPUT)
     for j, item in enumerate(model.inputs):
         value = events.value[rows, j]
         known = np.isfinite(value)
-        yield from _outside(item, value[known], t[rows[known]])
+        yield from _outside(item, "outside", item.fitted, value[known], value[known], t[rows[known]])
 
 
-def _outside(item: State | Input, value: np.ndarray, t: np.ndarray) -> Iterator[FoundEpisode]:
-    if item.fitted is None:
+def _outside(
+    item: State | Input,
+    cause: str,
+    limits: tuple[float, float] | None,
+    highest: np.ndarray,
+    lowest: np.ndarray,
+    t: np.ndarray,
+) -> Iterator[FoundEpisode]:
+    if limits is None:
         return
-    low, high = item.fitted
-    for run in runs((value < low) | (value > high), JOINED):
-        own = value[run.begin : run.end]
+    low, high = limits
+    for run in runs((highest < low) | (lowest > high), JOINED):
+        own = 0.5 * (highest + lowest)[run.begin : run.end]
         smallest, largest = float(np.nanmin(own)), float(np.nanmax(own))
         size = largest if largest > high else smallest
         facts = TwinFacts(
             name=item.name,
-            cause="outside",
+            cause=cause,
             start=run.start(t),
             size=size,
             unit=item.unit,
             limits=f"{low:g} to {high:g}",
         )
-        found = _found("range", facts, run.over(t), smallest, largest, run, t)
-        yield found._replace(episode=found.episode._replace(grade="advisory")) if item.widens else found
+        found = _found(cause, facts, run.over(t), smallest, largest, run, t)
+        yield (
+            found._replace(episode=found.episode._replace(grade="advisory"))
+            if cause == "outside" and item.widens
+            else found
+        )
 
 
 def impoverished_particles(judged: JudgedRows) -> Iterator[FoundEpisode]:

@@ -10,7 +10,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from estimators.diagnostics.detector_state import no_baseline
-from estimators.diagnostics.detectors import ADVISORY_ALARM, ALARM_NAMES, OUTSIDE, OUTSIDE_WIDENED
+from estimators.diagnostics.detectors import ADVISORY_ALARM, ALARM_NAMES, IMPOSSIBLE, OUTSIDE, OUTSIDE_WIDENED
 from estimators.diagnostics.health import HealthPolicy
 from estimators.fold import Fold, fold
 from estimators.log import INPUT, READING, RESET, TICK, TRUTH, Events, Log
@@ -54,7 +54,10 @@ def other(x, u, p, out):
 MODEL = StateSpaceModel(
     name="tanks",
     title="two tanks",
-    states=(State("a", "m", mean=0.0, std=1.0, fitted=(-3.0, 3.0)), State("b", "m", mean=0.0, std=1.0)),
+    states=(
+        State("a", "m", mean=0.0, std=1.0, fitted=(-3.0, 3.0), limits=(-3.5, 3.5)),
+        State("b", "m", mean=0.0, std=1.0),
+    ),
     inputs=(Input("feed", "m/s", fitted=(-1.0, 1.0), widens=True),),
     noises=(Noise("a", "m²/s", 0.04), Noise("b", "m²/s", 0.04)),
     sensors=(
@@ -354,6 +357,8 @@ def by_definition(events, track, gate, baseline, expected):
             flags |= OUTSIDE
         elif not -1.0 <= feed <= 1.0:
             flags |= OUTSIDE_WIDENED
+        if abs(track.mean[i, 0]) - 1.959963984540054 * track.std[i, 0] > 3.5:
+            flags |= IMPOSSIBLE
         said = set().union(*(row.said for row in rows))
         if not heard:
             health = STALE if now - begun > POLICY.stale_after else WAITING
@@ -473,7 +478,7 @@ def test_all_that_can_be_said_is_said_in_those_streams():
         healths |= set(track.health)
         verdicts |= set(track.verdict)
     assert bits == (1 << len(ALARM_NAMES)) - 1 | ADVISORY_ALARM
-    assert flags == OUTSIDE | OUTSIDE_WIDENED | 0b111
+    assert flags == OUTSIDE | OUTSIDE_WIDENED | IMPOSSIBLE | 0b111
     assert healths == {WAITING, TRACKING, ADVISORY, SUSPECT, DEGRADED, DIVERGED, STALE}
     assert verdicts >= {USED, GATED, HELD_OUT, MISSING, SCREENED}
 

@@ -30,7 +30,7 @@ def walk(x, u, p, dt, out):
 MODEL = level_model(
     {"gauge": 0.04, "chain": {f"c{k}": 1.0 for k in range(ROWS)}},
     0.0025,
-    states=(State("level", "m", mean=0.0, std=1.0, fitted=(-20.0, 20.0)),),
+    states=(State("level", "m", mean=0.0, std=1.0, fitted=(-20.0, 20.0), limits=(-100.0, 100.0)),),
     inputs=(Input("feed", "m/s", fitted=(-1.0, 1.0)),),
     f=walk,
     linear=True,
@@ -235,6 +235,10 @@ def test_an_input_outside_its_range():
     # The level sinks 1.5 m a second from about 0: beyond -20 after some 13 s.
     level = found["level", "outside"]
     assert BEGIN + 10 <= level.start <= BEGIN + 17 and level.unit == "m" and level.size < -250.0
+    each, track = found["level", "impossible"], fold.track
+    beyond = fold.log.t[: fold.n][track.mean[:, 0] + 1.959963984540054 * track.std[:, 0] < -100.0] * 1e-9
+    assert (each.start, each.size, each.grade) == (beyond[0], track.mean[:, 0].min(), "suspect")
+    assert each.text.startswith(f"level is {each.size:.4g} m, and its band lies beyond -100 to 100, since ")
 
 
 def test_a_gate_that_refuses_all_is_divergence():
