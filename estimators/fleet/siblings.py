@@ -7,6 +7,7 @@ from typing import NamedTuple
 import numpy as np
 from scipy.optimize import brentq
 from scipy.stats import false_discovery_control, norm
+from scipy.stats import t as student
 
 from ..errors import EstimatorError
 
@@ -42,8 +43,13 @@ def siblings(mean: np.ndarray, std: np.ndarray, *, rate: float = 0.05) -> Siblin
         median of abs(mean_i - m) / sqrt(t² + s_i²) = 0.6745
 
     as Paule and Mandel solve for the mean square; t is 0 if the estimates differ by no more than their own deviations
-    tell. The p-values of the assets are corrected for their number: of the assets that are reported, a share `rate` are
-    on average false alarms. The uncertainty of m and t themselves is neglected: with few assets the share is larger.
+    tell. The p-values of the assets are corrected for their number: of the assets that are reported, at most a share
+    `rate` are on average false alarms.
+
+    m and t are estimates too, so a p-value is that of Student's t. A median deviation has the relative variance
+    1 / (2 · 0.37 n), as the root of χ² / ν with ν = 0.37 n; its lower tail, which makes the false alarms, is shorter.
+    ν = 0.42 n + 1, less a half for odd n, is fitted to simulated fleets of 8 to 2,000 equal assets with t far above s:
+    5 % of them have a false alarm at the rate 0.05. Fewer have one where t is not, as its estimate is never below 0.
 
     Args:
         mean: Estimates, shape (N,), in the quantity's unit; not finite where there is none yet.
@@ -55,7 +61,8 @@ def siblings(mean: np.ndarray, std: np.ndarray, *, rate: float = 0.05) -> Siblin
             estimate.
 
     Sources: R. C. Paule and J. Mandel (1982), Consensus values and weighting factors, J. Res. NBS 87(5); Y. Benjamini
-    and Y. Hochberg (1995), Controlling the false discovery rate, J. R. Stat. Soc. B 57(1).
+    and Y. Hochberg (1995), Controlling the false discovery rate, J. R. Stat. Soc. B 57(1); P. J. Rousseeuw and C. Croux
+    (1993), Alternatives to the median absolute deviation, JASA 88(424), for its efficiency.
     """
     x, s = np.asarray(mean, float), np.asarray(std, float)
     if x.ndim != 1 or s.shape != x.shape:
@@ -73,7 +80,9 @@ def siblings(mean: np.ndarray, std: np.ndarray, *, rate: float = 0.05) -> Siblin
     z = np.divide(away, width, out=np.where(away == 0.0, 0.0, np.copysign(np.inf, away)), where=width > 0.0)
     z[~known] = np.nan
     least = np.full(x.shape, np.nan)
-    least[known] = false_discovery_control(2.0 * norm.sf(np.abs(z[known])))
+    count = np.count_nonzero(known)
+    freedom = 0.42 * count + 1.0 - 0.5 * (count % 2)
+    least[known] = false_discovery_control(2.0 * student.sf(np.abs(z[known]), freedom))
     return Siblings(centre, spread, z, least, least <= rate)
 
 
@@ -87,8 +96,8 @@ def _spread(x: np.ndarray, s: np.ndarray) -> tuple[float, float]:
         if not width.all():  # of values that are known exactly
             centre = float(np.median(x))
             return centre, float(np.median(np.abs(x - centre)))
-        total = np.cumsum(1.0 / width)
-        centre = float(x[np.searchsorted(total, 0.5 * total[-1])])
+        weight = 1.0 / width
+        centre = float(np.interp(0.5 * weight.sum(), np.cumsum(weight) - 0.5 * weight, x))
         return centre, float(np.median(np.abs(x - centre) / width)) - QUARTILE
 
     if excess(0.0)[1] <= 0.0:

@@ -25,8 +25,9 @@ def test_equal_deviations_have_the_closed_form():
     x = np.array([1.0, 2.0, 3.0, 4.0, 5.0, 6.0, 7.0, 8.0, 109.0])
     found = siblings(x, np.full(9, 0.5))
     # The median is 5 and the median deviation 2, of which 0.5 is the estimates' own.
-    assert (found.mean, found.std) == (5.0, pytest.approx(np.sqrt((2.0 / norm.ppf(0.75)) ** 2 - 0.25), rel=1e-12))
-    np.testing.assert_allclose(found.z, (x - 5.0) * norm.ppf(0.75) / 2.0, rtol=1e-12)
+    std = np.sqrt((2.0 / norm.ppf(0.75)) ** 2 - 0.25)
+    assert (found.mean, found.std) == (pytest.approx(5.0, rel=1e-12), pytest.approx(std, rel=1e-12))
+    np.testing.assert_allclose(found.z, (x - 5.0) * norm.ppf(0.75) / 2.0, rtol=1e-12, atol=1e-12)
     assert found.differs.tolist() == [False] * 8 + [True]
 
 
@@ -35,6 +36,28 @@ def test_estimates_that_agree_have_no_spread():
     assert found.std == 0.0 and not found.differs.any()
     exact = siblings(np.full(9, 3.0), np.zeros(9))
     assert (exact.mean, exact.std) == (3.0, 0.0) and np.all(exact.rate == 1.0)
+
+
+@pytest.mark.parametrize(("count", "differ"), [(8, 0), (9, 0), (50, 0), (400, 0), (20, 2)])
+def test_false_discoveries_of_a_small_fleet_are_as_few(count, differ):
+    """Of equal assets any alarm is false. A share of 5 % is right if it lies within three of its standard errors."""
+    rng, runs = np.random.default_rng(count + differ), 1000
+    shares = np.empty(runs)
+    for k in range(runs):
+        x = rng.normal(size=count)
+        x[:differ] += 6.0
+        found = siblings(x, np.zeros(count), rate=0.05).differs
+        shares[k] = found[differ:].sum() / max(1, found.sum())
+    error = 3.0 * np.sqrt(0.05 * 0.95 / runs)
+    assert np.mean(shares) < 0.05 + error
+    assert differ or np.mean(shares) > 0.05 - error
+
+
+def test_the_centre_of_an_even_fleet_is_half_way():
+    """Turning the signs round turns the result round."""
+    x, s = np.random.default_rng(4).normal(size=8), np.full(8, 0.1)
+    one, other = siblings(x, s), siblings(-x, s)
+    np.testing.assert_allclose(one.z, -other.z, rtol=1e-9)
 
 
 def test_the_rate_of_false_discoveries_is_the_one_asked_for():
