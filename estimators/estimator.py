@@ -88,6 +88,20 @@ class Code(NamedTuple):
 code_type = types.NamedUniTuple(i64, len(Code._fields), Code)
 
 
+CONSTANT, TANGENT, POINTS = range(3)
+"""Prediction rule of a filter: the one F of a linear model, the tangent of f at the estimate, sigma points."""
+
+COVARIANCE, FACTOR, MEMBERS, TRAJECTORIES = range(4)
+"""Form of the covariance in a filter's state: P, a factor of it, the members of an ensemble, or particles' paths."""
+
+
+class SmoothingRule(NamedTuple):
+    """Prediction rule (CONSTANT, TANGENT, POINTS; unused for members and particles), and form of the covariance."""
+
+    rule: int
+    holds: int = COVARIANCE
+
+
 @dataclass(frozen=True)
 class Estimator:
     """Entry of the catalogue.
@@ -109,7 +123,9 @@ class Estimator:
 
     `fixed_r`: the gain is for one R, so that measurements cannot have their own. `needs_factor`: the filter needs the
     Cholesky factor of its initial covariance. `singular`: P and R may be singular. `considers`: a model may have
-    considered states.
+    considered states. `linearises`: derivatives stand for f and h. `samples`: the estimate is that of a random sample,
+    so that it has noise of its own; a fold of a compiled one uses all processors. `smoothing`: how it is smoothed, None
+    if it cannot be.
     """
 
     name: str
@@ -140,6 +156,14 @@ class Estimator:
     blocks: Callable[[Options, np.ndarray, int], np.ndarray] | None = None
     singular: bool = False
     considers: bool = False
+    linearises: bool = False
+    samples: bool = False
+    smoothing: SmoothingRule | None = None
+
+    @property
+    def marginal(self) -> bool:
+        """Whether its predictions are not Gaussian, so that `Track.whitened` holds each row by itself."""
+        return self.samples and not self.interpreted
 
     def complete(self, options: Mapping[str, float | str]) -> dict[str, float]:
         """Return the given options and the defaults of the others; a choice may be given as its word.

@@ -56,7 +56,7 @@ class Machine:
         # Only particle filters represent a jumping mode; the others treat it as a number.
         self.compiled = compile_model(model if estimator.family == "particle" else indicator(model))
         self.bounds: Bounds = chi_square_bounds(model.width * max(1, policy.window))
-        self.marginal = estimator.family in ("particle", "ensemble")
+        self.marginal = estimator.marginal
         reopens = tuning.reopen is not None and model.nx <= LARGE
         self.rule = doubt.rule_of(tuning.gate, tuning.gate_kind, reopens)
         self.gate_limits = np.full(model.width + 1, np.inf)

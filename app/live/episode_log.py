@@ -130,7 +130,7 @@ class EpisodeLog:
     def _new_tracker(self, pull: Pull) -> EpisodeTracker:
         assert pull.settings is not None
         tuning, estimator = pull.settings
-        marginal = find_estimator(estimator, tuning.model).family in ("particle", "ensemble")
+        marginal = find_estimator(estimator, tuning.model).marginal
         return EpisodeTracker(
             self._engine.model,
             tuning,

@@ -171,6 +171,6 @@ def reason_against(model: StateSpaceModel, estimator: str) -> str:
     """Return why nudges of this twin are not folded beside it; empty if they are. Sizes `sensitivity` checks itself."""
     if model.black_box:
         return f"{model.name} is a black box, which is too slow to be folded again all the time; see nisus check"
-    if find_entry(estimator).family in ("particle", "ensemble"):
+    if find_entry(estimator).samples:
         return f"{estimator} draws at random, and its nudges would be noise; see nisus check"
     return ""

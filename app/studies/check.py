@@ -112,7 +112,7 @@ def check(twin: Twin, log: Log, counts: Counter[str], *, executor: Executor | st
     fold.finish()
     measured = Measured(twin, log, executor=executor)
     readings = int(np.sum(log.kind[: log.n] == READING))
-    covariance = fold.estimator.family not in ("particle", "ensemble")
+    covariance = not fold.estimator.samples
     present, *onsets = sensitivities(
         twin.estimator, model, tuning, log, false_alarm=twin.policy.false_alarm_every, executor=executor
     )

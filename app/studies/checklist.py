@@ -9,6 +9,7 @@ from estimators.diagnostics.sensitivity.checklist import MAX_PROCESSOR_SHARE, sp
 from estimators.diagnostics.sensitivity.posterior import FREQUENT_SHARE
 from estimators.diagnostics.sensitivity.responses import digits
 from estimators.log import MAINTENANCE
+from estimators.registry import ESTIMATORS, unfit
 
 from ..present.export.calibration_lines import health_shares
 from .advice.measured import bytes_text, seconds_text
@@ -18,7 +19,6 @@ from .scores import scores_file
 YES, PARTLY, NO, NONE = "yes", "partly", "no", "not told"
 
 MAX_CONDITIONING = 1e8  # conditioning beyond which the information of the weakest direction is rounding
-LINEARISING = ("ekf", "iekf", "sr_ekf", "filterpy_ekf", "pf_ekf")
 
 Answer = tuple[str, str, str]  # answer, figures, remedy
 
@@ -34,7 +34,7 @@ def _linearity(checked: Checked) -> Answer:
         return NONE, found.reason, ""
     if not found.passes:
         remedy = f"{name}, which runs here, does not linearise"
-        return NO, found.text, "ukf or ckf see the curvature" if name in LINEARISING else remedy
+        return NO, found.text, "ukf or ckf see the curvature" if checked.fold.estimator.linearises else remedy
     if found.white:
         return YES, found.text, ""
     return PARTLY, found.text, "correlation above zero: more Q, or a state is missing; below: less Q"
@@ -82,8 +82,10 @@ def _posterior(checked: Checked) -> Answer:
         )
     figures = "; ".join(said)
     if not found.reason and not found.recoveries and found.several > FREQUENT_SHARE:
-        one = f"{checked.twin.estimator} has one peak: use pf, pf_ekf or rbpf"
-        return YES, figures, one if checked.fold.estimator.peaks is None else "particles carry the peaks"
+        fold = checked.fold
+        able = [entry.name for entry in ESTIMATORS.values() if entry.peaks and unfit(entry, fold.model) is None]
+        one = f"{fold.estimator.name} has one peak: use {', '.join(able)}"
+        return YES, figures, "particles carry the peaks" if fold.estimator.peaks else one
     # A few of many rows have heavy tails by chance.
     if heavy <= FREQUENT_SHARE * len(checked.tails):
         return NONE if found.reason and worst is None else NO, figures, ""

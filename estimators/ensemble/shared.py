@@ -33,7 +33,8 @@ from ..compiled.context import (
 )
 from ..compiled.context import options as numbers
 from ..compiled.noise import add_noise, belief_root, noise_root
-from ..estimator import Estimator, Option, Options
+from ..estimator import MEMBERS as HELD
+from ..estimator import TANGENT, Estimator, Option, Options, SmoothingRule
 from ..model.state_space import LARGE, StateSpaceModel
 from ..numerics.jit import ints, jit
 from ..numerics.linalg import wrap
@@ -362,6 +363,8 @@ def ensemble_filter(*own: Option, **fields: Any) -> Estimator:
     """Return an `Estimator` with the parts that all ensemble filters share, and options of its own."""
     return Estimator(
         family="ensemble",
+        samples=True,
+        smoothing=SmoothingRule(TANGENT, HELD),
         model_runs="members",
         runs=lambda options, nx: options["members"],
         state_size=state_size,

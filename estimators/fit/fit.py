@@ -22,7 +22,7 @@ from ..tuning import Tuning
 from .aims import LIKELIHOOD, WITNESSES, aim_of, sensors_in_turn
 from .entries import DIGITS, PLAIN_DIGITS, Setting, Skipped, TuningEntry, entries_of, with_values
 from .judge import POWERS, FitVerdict, Tempered, Worth, tempered
-from .objective import ALONE, SEARCH_FOLDS, SHARES, FitProgress, Go, Objective, maximise, polished, search
+from .objective import SEARCH_FOLDS, SHARES, FitProgress, Go, Objective, maximise, polished, search
 from .recording import BLOCKS, Recording, held_out_rows, until_last_fitted, without_queries, without_stuck
 from .uncertainty import (
     NEARBY,
@@ -177,7 +177,7 @@ def fit(
         penalised=penalised,
         executor=executor,
     )
-    alone = find_estimator(estimator, tuning.model).family in ALONE
+    alone = find_estimator(estimator, tuning.model).samples
     settings = 2 if not blocks else 1 + len(POWERS)
     # Sensors are held out in turn at the start and at the chosen point, unless they are the aim.
     in_turn = (settings if aimed.sensors else 2) * len(sensors_in_turn(Setting(tuning, None), whole))

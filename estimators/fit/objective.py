@@ -55,7 +55,6 @@ STEP = 1e-4
 """Step of the differences, in logarithms or deviations: the error of a difference, half the step times the curvature,
 is far below the deviation of an estimate, and rounding even more."""
 
-ALONE = ("particle", "ensemble")  # Families whose folds run one after the other: each of them uses all processors
 MAX_STEPS = 200  # Most quasi-Newton steps
 MAX_ROUNDS = 8  # Most rounds of L-BFGS-B, each with a new scale
 ROUND_STEPS = 15  # Steps per round
@@ -140,7 +139,7 @@ def each_folded(
     Raises:
         Cancelled: If `go` returns False.
     """
-    alone = executor == "threads" and find_estimator(estimator, model).family in ALONE
+    alone = executor == "threads" and find_estimator(estimator, model).samples
 
     def count() -> None:
         if not go(folds):

@@ -11,7 +11,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from ..estimator import Estimator, Options
+from ..estimator import POINTS, Estimator, Options, SmoothingRule
 from ..model.state_space import StateSpaceModel
 from ..tuning import Tuning
 from .robust import OPTIONS, memory, shared_options
@@ -47,5 +47,6 @@ CKF = Estimator(
     needs_factor=True,
     tune=tune,
     memory=memory,
+    smoothing=SmoothingRule(POINTS),
     considers=True,
 )

@@ -6,7 +6,7 @@ import numpy as np
 
 from ..compiled.context import estimated, expect, options, row_count, transition
 from ..compiled.jacobians import scratch_size, sensor_jacobian, state_jacobian
-from ..estimator import Estimator, Options
+from ..estimator import TANGENT, Estimator, Options, SmoothingRule
 from ..model.state_space import StateSpaceModel
 from ..numerics.jit import by_address, embedded, inlined, part
 from ..numerics.linalg import congruence, mirror, solve_transposed
@@ -250,5 +250,7 @@ EKF = Estimator(
     tune=tune,
     memory=memory,
     considers=True,
+    linearises=True,
+    smoothing=SmoothingRule(TANGENT),
     singular=True,
 )

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from ..compiled.context import estimated, transition
 from ..compiled.jacobians import state_jacobian
-from ..estimator import Estimator, Options
+from ..estimator import CONSTANT, Estimator, Options, SmoothingRule
 from ..model.state_space import StateSpaceModel
 from ..numerics.jit import by_address, floats, inlined
 from ..numerics.linalg import congruence
@@ -90,5 +90,6 @@ KF = Estimator(
     memory=memory,
     considers=True,
     singular=True,
+    smoothing=SmoothingRule(CONSTANT),
     applies=applies,
 )

@@ -8,7 +8,7 @@ import numpy as np
 
 from ..compiled.context import estimated, expect, row_count, transition
 from ..compiled.jacobians import scratch_size, sensor_jacobian, state_jacobian
-from ..estimator import Options
+from ..estimator import FACTOR, TANGENT, Options, SmoothingRule
 from ..numerics.jit import by_address, inlined, part
 from ..numerics.linalg import triangularise
 from ..numerics.workspace import declare_layout, size_of, start_of, take_matrix
@@ -147,5 +147,6 @@ SR_EKF = replace(
     state_size=state_size,
     work_size=work_size,
     moments=moments,
+    smoothing=SmoothingRule(TANGENT, FACTOR),
     options=OPTIONS,
 )

@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import replace
 
 from ..compiled.context import transition
-from ..estimator import Options
+from ..estimator import CONSTANT, FACTOR, Options, SmoothingRule
 from ..numerics.jit import by_address
 from ..numerics.workspace import size_of, start_of
 from . import sr_ekf
@@ -45,5 +45,6 @@ SR_KF = replace(
     functions=(start, predict, sr_ekf.update, describe),
     work_size=work_size,
     moments=moments,
+    smoothing=SmoothingRule(CONSTANT, FACTOR),
     options=OPTIONS,
 )

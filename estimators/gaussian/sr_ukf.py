@@ -14,7 +14,7 @@ from dataclasses import replace
 import numpy as np
 
 from ..compiled.context import circular_rows, circular_states, estimated, expect_points, row_count, transition_points
-from ..estimator import Options
+from ..estimator import FACTOR, POINTS, Options, SmoothingRule
 from ..numerics.jit import by_address, inlined
 from ..numerics.linalg import remove, triangularise
 from ..numerics.simd_ir import padded
@@ -153,6 +153,7 @@ SR_UKF = replace(
     work_size=work_size,
     moments=moments,
     points=points,
+    smoothing=SmoothingRule(POINTS, FACTOR),
     needs_factor=False,
     singular=True,
 )

@@ -22,7 +22,7 @@ from ..compiled.context import (
     row_count,
     transition_points,
 )
-from ..estimator import Estimator, Option, Options
+from ..estimator import POINTS, Estimator, Option, Options, SmoothingRule
 from ..model.state_space import StateSpaceModel
 from ..numerics.jit import by_address, inlined, jit
 from ..numerics.linalg import EPSILON, wrap
@@ -209,6 +209,7 @@ UKF = Estimator(
     tune=tune,
     memory=memory,
     considers=True,
+    smoothing=SmoothingRule(POINTS),
     refuses=refuses,
 )
 

@@ -369,7 +369,7 @@ class Estimates:
 
     def episodes(self) -> list[Episode]:
         """Return the episodes of alarms with cause, size and remedy: see docs/alarms.md."""
-        marginal = find_estimator(self.estimator, self.model).family in ("particle", "ensemble")
+        marginal = find_estimator(self.estimator, self.model).marginal
         return episodes_of(JudgedRows(self.model, self.tuning, marginal, self.events, self.track))
 
     def score(self) -> Score:

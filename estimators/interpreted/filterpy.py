@@ -331,6 +331,7 @@ FILTERPY_EKF = _entry(
     assumes="differentiable f and h, nearly straight within the spread of the estimate",
     model_runs="1 and its derivatives",
     fails_when="as ekf; in Python, a hundred times slower",
+    linearises=True,
     runs=lambda options, nx: nx + 1,
 )
 FILTERPY_UKF = _entry(
@@ -355,5 +356,6 @@ FILTERPY_ENKF = _entry(
     state_size=ensemble.state_size,
     moments=ensemble.moments,
     points=ensemble.points,
+    samples=True,
     options=(Option("members", 50, 2, 10_000, "", "number of members"),),
 )

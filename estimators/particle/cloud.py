@@ -191,6 +191,7 @@ def account(options: Options, state: np.ndarray, nx: int) -> dict[str, float | l
 
 SHARED: dict[str, Any] = {
     "family": "particle",
+    "samples": True,
     "moments": moments,
     "points": points,
     "peaks": peaks,

@@ -34,7 +34,7 @@ from ..compiled.context import (
 from ..compiled.context import options as numbers
 from ..compiled.noise import add_noise, belief_root, has_correlated_rows, independent_rows, noise_root
 from ..compiled.verdict import LOG_2PI
-from ..estimator import Estimator, Option, Options
+from ..estimator import POINTS, TRAJECTORIES, Estimator, Option, Options, SmoothingRule
 from ..gaussian.shared import admit
 from ..model.state_space import StateSpaceModel
 from ..numerics.jit import ints, jit
@@ -387,6 +387,7 @@ PF = Estimator(
     work_size=work_sized(room_at),
     blocks=block,
     prepare=phases(propagate_block, weigh_block, smooth_block),
+    smoothing=SmoothingRule(POINTS, TRAJECTORIES),
     considers=True,
     **SHARED,
 )

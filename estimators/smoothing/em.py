@@ -44,8 +44,7 @@ from ..track import USED
 from ..tuning import Tuning
 from .moments_back import MomentsBack
 from .notes import solve_semidefinite
-from .recorder import MEMBERS
-from .smooth import KINDS, check_smooth
+from .smooth import check_smooth
 from .walk import Smoothed, Walk
 
 MAX_EXTRAPOLATION = 5.0  # Largest extrapolation of the logarithm of a variance
@@ -161,7 +160,7 @@ def _check(fold: Fold) -> None:
     """Refuse a filter or a model for which the equations do not hold."""
     name, model = fold.estimator.name, fold.model
     check_smooth(fold.estimator, model, fold.options)
-    if name not in KINDS or KINDS[name].holds == MEMBERS:
+    if fold.estimator.samples:
         raise EstimatorError(f"em: {name} draws at random; use a Gaussian filter")
     if model.correlated:
         raise EstimatorError(f"em: rows of a sensor of {model.name} are correlated, and each variance is fitted alone")
@@ -181,7 +180,8 @@ def _round(fold: Fold) -> tuple[np.ndarray, np.ndarray]:
     model, log, n = fold.model, fold.log, fold.model.nx
     lag = np.empty((fold.n, n, n))
     out = Smoothed.room_for(fold)
-    Walk(fold, MomentsBack(fold, KINDS[fold.estimator.name], out, lag)).back()
+    assert fold.estimator.smoothing is not None
+    Walk(fold, MomentsBack(fold, fold.estimator.smoothing, out, lag)).back()
     cov = np.empty((fold.n, n, n))
     cov[:, range(n), range(n)] = out.std**2
     i, j = np.triu_indices(n, 1)

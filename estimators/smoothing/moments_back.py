@@ -15,7 +15,15 @@ import numpy as np
 from numba import types
 
 from ..compiled.context import context_type
-from ..estimator import code_type, describe_signature, predict_signature, start_signature, update_signature
+from ..estimator import (
+    MEMBERS,
+    SmoothingRule,
+    code_type,
+    describe_signature,
+    predict_signature,
+    start_signature,
+    update_signature,
+)
 from ..fold import Fold
 from ..fold_kernel import advance_to, asks
 from ..gaussian.shared import tell
@@ -26,9 +34,7 @@ from ..numerics.workspace import size_of
 from ..snapshots import Snapshot
 from .notes import STAYED, StepNote, changed, copy, cut, join_moments, step_at, step_back, step_layout, widened
 from .recorder import (
-    MEMBERS,
     ROW,
-    SmoothingRule,
     StepRecorder,
     covariance_of,
     describe,

@@ -21,7 +21,12 @@ from ..compiled.context import circular_states, options, transition_points
 from ..compiled.jacobians import scratch_size, state_jacobian
 from ..ensemble.shared import SIZE, column_mean, ensemble
 from ..estimator import (
+    CONSTANT,
+    FACTOR,
+    MEMBERS,
+    POINTS,
     Code,
+    SmoothingRule,
     call_describe,
     call_predict,
     call_start,
@@ -41,17 +46,9 @@ from ..numerics.simd_rows import cross_covariance, factor, spread_points
 from ..numerics.workspace import declare_layout, layout, size_of, take_matrix, take_vector
 from .notes import CUT, STAYED, copy, cut, finite, join, solve_semidefinite, step_at, step_layout
 
-CONSTANT, TANGENT, POINTS = range(3)
-"""Prediction rule of a filter: the one F of a linear model, the tangent of f at the estimate, sigma points."""
-
-
 START, PREDICT, UPDATE, DESCRIBE, OWN, RULE, HELD, ROW, TAPE, SCRATCH, HEAD = range(11)
 """Positions in the head: addresses of the filter's functions, length of its state, prediction rule, form of its
 covariance, row of the tape that is written, addresses of tape and scratch."""
-
-
-COVARIANCE, FACTOR, MEMBERS = range(3)
-"""Form of the covariance in a filter's state: P, a factor of it, or the members of an ensemble."""
 
 
 class CrossScratch(NamedTuple):
@@ -274,13 +271,6 @@ def describe(context, state, mean, std, cross):
     ahead = step_at(head[TAPE], head[ROW], context.nx, own.size)
     ahead.kind[0] = STAYED
     call_describe(head[DESCRIBE], context, own, mean, std, cross)
-
-
-class SmoothingRule(NamedTuple):
-    """Prediction rule (CONSTANT, TANGENT, POINTS; unused for ensembles) and form of the covariance of a filter."""
-
-    rule: int
-    holds: int
 
 
 class StepRecorder:

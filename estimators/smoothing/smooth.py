@@ -10,32 +10,15 @@ from collections.abc import Mapping
 import numpy as np
 
 from ..errors import EstimatorError
-from ..estimator import Estimator
+from ..estimator import MEMBERS, TRAJECTORIES, Estimator
 from ..fold import Fold
 from ..model.state_space import StateSpaceModel
 from ..numerics.linalg import wrapped
+from ..registry import ESTIMATORS
 from ..track import Track
 from .moments_back import MomentsBack
-from .recorder import CONSTANT, COVARIANCE, FACTOR, MEMBERS, POINTS, TANGENT, SmoothingRule
 from .trajectories_back import TrajectoriesBack
 from .walk import Notes, Smoothed, Walk
-
-KINDS = {
-    "kf": SmoothingRule(CONSTANT, COVARIANCE),
-    "kf-steady": SmoothingRule(CONSTANT, COVARIANCE),
-    "ekf": SmoothingRule(TANGENT, COVARIANCE),
-    "iekf": SmoothingRule(TANGENT, COVARIANCE),
-    "ukf": SmoothingRule(POINTS, COVARIANCE),
-    "ckf": SmoothingRule(POINTS, COVARIANCE),
-    "sr-kf": SmoothingRule(CONSTANT, FACTOR),
-    "sr-ekf": SmoothingRule(TANGENT, FACTOR),
-    "sr-ukf": SmoothingRule(POINTS, FACTOR),
-    **dict.fromkeys(("enkf", "etkf", "ensrf", "letkf"), SmoothingRule(TANGENT, MEMBERS)),
-}
-"""Filters that are smoothed by means and covariances."""
-
-
-PARTICLES = ("pf", "pf-reg")  # Filters that are smoothed by trajectories
 
 
 def check_smooth(estimator: Estimator, model: StateSpaceModel, options: Mapping[str, float | str]) -> None:
@@ -44,8 +27,9 @@ def check_smooth(estimator: Estimator, model: StateSpaceModel, options: Mapping[
     Raises:
         EstimatorError: With the reason.
     """
-    if estimator.name not in (*KINDS, *PARTICLES):
-        raise EstimatorError(f"{estimator.name} cannot be smoothed; use {', '.join((*KINDS, *PARTICLES))}")
+    if estimator.smoothing is None:
+        able = ", ".join(entry.name for entry in ESTIMATORS.values() if entry.smoothing)
+        raise EstimatorError(f"{estimator.name} cannot be smoothed; use {able}")
     if model.considered:
         # The gains of a smoother suppose that those of the filter are optimal. Otherwise its covariance is still right,
         # but can be many times that of the filter.
@@ -56,7 +40,7 @@ def check_smooth(estimator: Estimator, model: StateSpaceModel, options: Mapping[
         )
     if model.black_box:
         raise EstimatorError(f"{estimator.name} cannot be smoothed: {model.name} is a black box, which is not compiled")
-    if estimator.name in KINDS and KINDS[estimator.name].holds == MEMBERS:
+    if estimator.smoothing.holds == MEMBERS:
         members = int(estimator.complete(options)["members"])
         if members < model.nx + 2:
             raise EstimatorError(
@@ -74,8 +58,9 @@ def smooth(fold: Fold) -> Smoothed:
     check_smooth(fold.estimator, fold.model, fold.options)
     out = Smoothed.room_for(fold)
     if fold.n:
-        kind = KINDS.get(fold.estimator.name)
-        notes: Notes = TrajectoriesBack(fold, out) if kind is None else MomentsBack(fold, kind, out)
+        kind = fold.estimator.smoothing
+        assert kind is not None
+        notes: Notes = TrajectoriesBack(fold, out) if kind.holds == TRAJECTORIES else MomentsBack(fold, kind, out)
         Walk(fold, notes).back()
     return out
 

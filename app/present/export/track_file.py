@@ -94,7 +94,7 @@ class RunRows(NamedTuple):
     @property
     def marginal(self) -> bool:
         """Whether the filter's predictions are not Gaussian."""
-        return find_entry(self.run.estimator).family in ("particle", "ensemble")
+        return find_entry(self.run.estimator).marginal
 
     def episodes(self) -> list[Episode]:
         """Return its episodes by their start, as `nisus fold` finds them."""

@@ -22,7 +22,6 @@ from config.tunings import SPREADS
 from config.yaml_files import as_flow, parse, with_section
 from estimators.diagnostics.calibration import LIMITS
 from estimators.errors import ConfigError, NisusError
-from estimators.fit.objective import ALONE
 from estimators.log import Log
 from estimators.registry import find_entry, unfit
 
@@ -174,7 +173,7 @@ def _consistency(told: Advice, measured: Measured, *, ensemble: bool) -> None:
     """Check the chosen filter for consistency; if its innovations are correlated, try coloured noise."""
     claim = _ask(told, measured, "consistent", lambda _: consistent(measured, told.estimator, told.options))
     # A filter that draws is too slow to be fitted here, and has no likelihood that is smooth.
-    if claim.answer != NO or ensemble or find_entry(told.estimator).family in ALONE:
+    if claim.answer != NO or ensemble or find_entry(told.estimator).samples:
         return
     with _asking(measured, "lasting"):
         found = lasting(measured, told.estimator, told.options)

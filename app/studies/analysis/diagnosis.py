@@ -122,7 +122,7 @@ class Diagnosis:
         tuning, estimator = engine.folded_with()
         revision, events, track = last_rows(engine, DIAGNOSED_ROWS)
         status = engine.status()
-        marginal = find_entry(estimator).family in ("particle", "ensemble")
+        marginal = find_entry(estimator).marginal
         slow = self._figures.of(revision) if len(events) else None
         nis = nis_verdict(track, events, engine.model, tuning.baseline)
         sources = source_texts(engine.model, engine.belief().cov) if engine.model.considered else {}

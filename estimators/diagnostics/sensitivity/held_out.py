@@ -20,9 +20,6 @@ from .responses import each
 WORSE_MARGIN = 0.05
 """Share by which an error must exceed that of the open loop before the filter is said to make it worse."""
 
-MONTE_CARLO_FAMILIES = ("particle", "ensemble")
-"""Families whose folds run one after the other: each of them runs on all processors."""
-
 
 class HeldOutPrediction(NamedTuple):
     """Prediction of a sensor row without its sensor, over n measurements.
@@ -99,7 +96,7 @@ def held_out(estimator: str, model: StateSpaceModel, tuning: Tuning, log: Log) -
         fold.finish()
         return fold
 
-    executor = None if find_estimator(estimator, model).family in MONTE_CARLO_FAMILIES else "threads"
+    executor = None if find_estimator(estimator, model).samples else "threads"
     filtered, floor, *folds = each(run, [tuning, none, *without], executor)
     open_rows = _score(floor).held_out
     rows: list[HeldOutPrediction] = []

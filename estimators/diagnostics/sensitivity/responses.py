@@ -203,7 +203,7 @@ def stand_in(estimator: str, model: StateSpaceModel) -> tuple[str, str]:
     Raises:
         EstimatorError: If the estimator does not exist or does not apply to the model.
     """
-    if find_estimator(estimator, model).family not in ("particle", "ensemble"):
+    if not find_estimator(estimator, model).samples:
         return estimator, ""
     for name in DETERMINISTIC_FILTERS:
         if unfit(find_entry(name), model) is None:

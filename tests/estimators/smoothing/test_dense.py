@@ -14,14 +14,14 @@ from estimators.log import READING, RESET, TICK, Events
 from estimators.model.state_space import Noise, Row, Sensor, State, StateSpaceModel
 from estimators.registry import ESTIMATORS
 from estimators.smoothing import moments_back, walk
-from estimators.smoothing.smooth import KINDS, smooth
+from estimators.smoothing.smooth import smooth
 from estimators.track import GATED
 from estimators.tuning import Tuning
 from tests.estimators.linear_models import CORRELATED, JointGaussian, case, close, random_linear, random_log
 from tests.models import constant_speed, first_state
 from tests.support import SECOND, as_log, assert_same, folded
 
-GAUSSIAN = [name for name in KINDS if ESTIMATORS[name].family == "Gaussian" and name != "kf-steady"]
+GAUSSIAN = [e.name for e in ESTIMATORS.values() if e.smoothing and e.family == "Gaussian" and e.name != "kf-steady"]
 CASES = [(nx, nu, seed) for nx, nu in ((1, 0), (3, 2), (5, 1)) for seed in (0, CORRELATED)]
 
 
