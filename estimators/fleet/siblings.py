@@ -48,7 +48,7 @@ def siblings(mean: np.ndarray, std: np.ndarray, *, rate: float = 0.05) -> Siblin
 
     m and t are estimates too, so a p-value is that of Student's t. A median deviation has the relative variance
     1 / (2 · 0.37 n), as the root of χ² / ν with ν = 0.37 n; its lower tail, which makes the false alarms, is shorter.
-    ν = 0.42 n + 1, less a half for odd n, is fitted to simulated fleets of 8 to 2,000 equal assets with t far above s:
+    ν = 0.42 n + 1, less a half for odd n, is fitted to simulated fleets of 8 to 1,000 equal assets with t far above s:
     5 % of them have a false alarm at the rate 0.05. Fewer have one where t is not, as its estimate is never below 0.
 
     Args:
