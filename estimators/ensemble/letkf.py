@@ -1,7 +1,8 @@
 """The local ensemble transform Kalman filter: the transform of the ETKF, anew for every state, from the rows near it.
 
 At each state the variance of a row is divided by the taper of its distance, so that far rows count less, and rows
-beyond the radius not at all. States are independent of each other; all threads share them.
+beyond the radius not at all. On a circle the distance is the short way round. States are independent of each other; all
+threads share them.
 
 Source: Hunt, Kostelich & Szunyogh (2007), doi:10.1016/j.physd.2006.11.008, with their smooth localisation: R⁻¹ times a
 factor that falls with the distance. Their inflation is of the forecast; here, as in all ensemble filters, it is of the
@@ -222,5 +223,5 @@ LETKF = ensemble_filter(
     work_size=lambda options, nx, ny: work_size(
         options, nx, ny, size_of(local_at, members(options), ny, min(ny, members(options)))
     ),
-    prepare=prepare,
+    prepare=lambda model, options: prepare(model, options, shortest=True),
 )

@@ -53,16 +53,20 @@ def gaspari_cohn(distance: np.ndarray, radius: float) -> np.ndarray:
     return np.where(z <= 1.0, near, np.where(z < 2.0, np.maximum(far, 0.0), 0.0))
 
 
-def taper_between(a: np.ndarray, b: np.ndarray, periods: np.ndarray, radius: float) -> np.ndarray:
+def taper_between(
+    a: np.ndarray, b: np.ndarray, periods: np.ndarray, radius: float, shortest: bool = False
+) -> np.ndarray:
     """Return the taper between places a and b (..., axes), on axes with these periods, infinite where not periodic.
 
-    On a periodic axis it is that of the distance the short way round, plus those of the ways that are full turns longer
-    and within the radius, relative to the sum at distance 0. The short way alone has a kink half way round, so from
-    a radius of half the period on it would not be positive definite, and neither the innovation covariance. The
-    sum is: its Fourier coefficients are values of the transform of the taper.
+    On a periodic axis with `shortest` it is that of the distance the short way round. Otherwise those of the ways that
+    are full turns longer and within the radius are added, relative to the sum at distance 0. The short way alone has a
+    kink half way round, so from a radius of half the period on it would not be positive definite, and neither the
+    innovation covariance. The sum is: its Fourier coefficients are values of the transform of the taper.
     """
     difference = np.abs(a - b) % periods
     difference = np.minimum(difference, periods - difference)
+    if shortest:
+        return gaspari_cohn(np.sqrt(np.sum(difference**2, axis=-1)), radius)
     # Of many turns the sum is nearly the same all the way round: 5e-5 less at most.
     uniform = radius > MAX_TURNS * periods
     difference, periods = np.where(uniform, 0.0, difference), np.where(uniform, radius / MAX_TURNS, periods)
@@ -99,13 +103,14 @@ def check_placed(model: StateSpaceModel, radius: float) -> None:
     )
 
 
-def prepare(model: StateSpaceModel, options: Options) -> np.ndarray:
+def prepare(model: StateSpaceModel, options: Options, shortest: bool = False) -> np.ndarray:
     """Return the layout of blocks, rows and tapers as int64s (float64s among them by their bits).
+
+    With `shortest` the tapers between rows and states are those of the short way round: weights need not be definite.
 
     Raises:
         EstimatorError: If a radius is given and the model has no positions of its states or sensors, or the layout
-        would
-            not fit into memory.
+            would not fit into memory.
     """
     radius = options.get("radius", 0.0)
     if not radius > 0:
@@ -126,7 +131,8 @@ def prepare(model: StateSpaceModel, options: Options) -> np.ndarray:
         own = np.array(sensor, float)
         where = np.where(boxed > 0, own % np.where(boxed > 0, boxed, 1.0), own)
         near = [np.array(tree.query_ball_point(place, radius), np.int64) for place in where]
-        tapers = [taper_between(places[found], place, periods, radius) for found, place in zip(near, own, strict=True)]
+        each = zip(near, own, strict=True)
+        tapers = [taper_between(places[found], place, periods, radius, shortest) for found, place in each]
         layout = _by_blocks(near, tapers, model.nx)
         between = taper_between(own[:, None], own[None], periods, radius)
         heads[k, 0] = layout[0].size
