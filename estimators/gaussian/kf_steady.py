@@ -21,7 +21,7 @@ import numpy as np
 
 from ..compiled.context import options, row_count, steps_of, transition
 from ..errors import EstimatorError
-from ..estimator import CONSTANT, Estimator, Option, Options, SmoothingRule
+from ..estimator import Estimator, Option, Options
 from ..model.parts import covariance_of
 from ..model.state_space import StateSpaceModel
 from ..numerics.jit import by_address, inlined, part
@@ -320,6 +320,5 @@ KF_STEADY = Estimator(
     ),
     tune=tune,
     applies=applies,
-    smoothing=SmoothingRule(CONSTANT),
     fixed_r=True,
 )

@@ -29,7 +29,9 @@ def check_smooth(estimator: Estimator, model: StateSpaceModel, options: Mapping[
     """
     if estimator.smoothing is None:
         able = ", ".join(entry.name for entry in ESTIMATORS.values() if entry.smoothing)
-        raise EstimatorError(f"{estimator.name} cannot be smoothed; use {able}")
+        # Optimal gains are supposed, as below.
+        why = ", as its gain is not optimal until it is steady" if estimator.fixed_r else ""
+        raise EstimatorError(f"{estimator.name} cannot be smoothed{why}; use {able}")
     if model.considered:
         # The gains of a smoother suppose that those of the filter are optimal. Otherwise its covariance is still right,
         # but can be many times that of the filter.

@@ -21,7 +21,7 @@ from tests.estimators.linear_models import CORRELATED, JointGaussian, case, clos
 from tests.models import constant_speed, first_state
 from tests.support import SECOND, as_log, assert_same, folded
 
-GAUSSIAN = [e.name for e in ESTIMATORS.values() if e.smoothing and e.family == "Gaussian" and e.name != "kf-steady"]
+GAUSSIAN = [entry.name for entry in ESTIMATORS.values() if entry.smoothing and entry.family == "Gaussian"]
 CASES = [(nx, nu, seed) for nx, nu in ((1, 0), (3, 2), (5, 1)) for seed in (0, CORRELATED)]
 
 

@@ -68,7 +68,7 @@ def test_the_same_draws_every_time():
 
 
 def test_estimates_that_cannot_be_smoothed_are_refused():
-    """Too few members, a state without noise, a mode."""
+    """Too few members, a state without noise, a mode, a gain that is not optimal."""
     model = MODELS["lorenz96"]
     with pytest.raises(EstimatorError, match="etkf cannot be smoothed: the covariance of 40 members"):
         smooth(Fold("etkf", model, Tuning.of(model).with_options({"members": 40}), Log.of(model)))
@@ -78,5 +78,7 @@ def test_estimates_that_cannot_be_smoothed_are_refused():
     with pytest.raises(EstimatorError, match="pf cannot be smoothed: in motor_winding .* has no noise of its own"):
         smooth(fold)
     model = MODELS["gripper_contact"]
+    with pytest.raises(EstimatorError, match="kf-steady cannot be smoothed, as its gain is not optimal.*; use kf"):
+        smooth(advanced("kf-steady", winding, log))
     with pytest.raises(EstimatorError, match="rbpf cannot be smoothed; use kf"):
         smooth(Fold("rbpf", model, Tuning.of(model), body_log([])))

@@ -5,7 +5,7 @@ from filterpy.kalman import JulierSigmaPoints, UnscentedKalmanFilter
 
 from estimators import Log, fold
 from estimators.model.state_space import Noise, Row, Sensor, State, StateSpaceModel
-from tests.estimators.smoothing.test_dense import BODY, START, VARIANCE, Q, moved
+from tests.estimators.smoothing.test_dense import START, VARIANCE, Q, moved
 
 DT, N = 0.3, 300
 
@@ -81,12 +81,3 @@ def test_filterpy_by_sigma_points():
         ours = fold(estimator, PENDULUM, log, covariance=True, smoothed=True, alpha=1.0, beta=0.0, kappa=1.0)
         np.testing.assert_allclose(ours.mean, expected, rtol=0, atol=1e-9)
         np.testing.assert_allclose(ours.cov, cov, rtol=0, atol=1e-9)
-
-
-def test_the_steady_filter_is_smoothed_as_the_kalman_filter_once_it_has_settled():
-    ys = drive(3)
-    steady = smoothed("kf-steady", BODY, ys, period=DT)
-    exact = smoothed("kf", BODY, ys)
-    # Its gain is that of the covariance from some dozen readings on; at first it is another, and the smoother's too.
-    np.testing.assert_allclose(steady.mean[60:], exact.mean[60:], rtol=0, atol=1e-6)
-    np.testing.assert_allclose(steady.std[60:], exact.std[60:], rtol=0, atol=1e-6)
