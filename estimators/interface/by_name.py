@@ -228,12 +228,11 @@ def _copied(log: Log) -> Events:
 
 
 def all_pairs(model: StateSpaceModel) -> np.ndarray:
-    """Return every pair of states i < j, (nx (nx - 1) / 2, 2)."""
-    if len(model.shown) < model.nx:
-        raise EstimatorError(
-            f"covariance: {model.name} has {model.nx:,} states, of which a track keeps some; leave it out"
-        )
-    return np.stack(np.triu_indices(model.nx, 1), axis=1)
+    """Return every pair of estimated states i < j, (n (n - 1) / 2, 2); considered ones come after these."""
+    n = model.nx - model.considered
+    if len(model.shown) < n:
+        raise EstimatorError(f"covariance: {model.name} has {n:,} states, of which a track keeps some; leave it out")
+    return np.stack(np.triu_indices(n, 1), axis=1)
 
 
 def _seeded(tuning: Tuning, seed: int) -> Tuning:
@@ -332,14 +331,14 @@ class Estimates:
 
     @property
     def cov(self) -> np.ndarray:
-        """Covariances after each event, (N, nx, nx).
+        """Covariances of the estimated states after each event, (N, n, n), in the order of `mean`.
 
         Raises:
             EstimatorError: If the fold did not keep them.
         """
         if not self.covariance:
             raise EstimatorError(NO_COVARIANCES)
-        n = self.model.nx
+        n = self.track.std.shape[1]
         cov = np.empty((len(self), n, n))
         cov[:, range(n), range(n)] = self.track.std**2
         i, j = np.triu_indices(n, 1)

@@ -8,14 +8,16 @@ import numpy as np
 import pytest
 from scipy.stats import chi2
 
-from estimators import MODELS, Log, fold, fold_many, mean_nees
+from estimators import MODELS, Log, Noise, Parameter, Row, Sensor, State, StateSpaceModel, fold, fold_many, mean_nees
 from estimators.diagnostics.consistency import Nees
 from estimators.errors import EstimatorError, EventError, NisusError
 from estimators.fold import fold as fold_track
 from estimators.log import INPUT, READING, TRUTH
+from estimators.model.assemble import JointParameter, joint
 from estimators.models.uwb_rover import HEADING, YAW_RATE_BIAS
 from estimators.track import HELD_OUT, USED
 from estimators.tuning import Tuning
+from tests.models import unchanged
 from tests.support import SECOND, assert_same, folded, log_of
 
 MOTOR = MODELS["motor_winding"]
@@ -203,6 +205,36 @@ def test_the_covariance_is_whole():
     np.testing.assert_array_equal(track.cov, np.transpose(track.cov, (0, 2, 1)))
     growing = folded("ekf", MODELS["lorenz63"], log, track.tuning)
     np.testing.assert_allclose(track.cov[-1], growing.moments()[1], rtol=1e-12)
+
+
+def test_the_covariance_of_estimated_states_contains_the_considered_ones():
+    """Of two levels that share an offset: Schmidt's gain moves only them, and P = (I - K H) P (I - K H)ᵀ + K R Kᵀ.
+
+    Without noise of the process or time between measurements, so the recursion is that of the update alone.
+    """
+
+    def both(x, u, p, out):
+        out[0] = x[0] + x[1] + p[0]
+
+    levels = StateSpaceModel(
+        "levels", "levels", states=(State("a", "1", 0.0, 1.0), State("b", "1", 0.0, 2.0)), f=unchanged, linear=True,
+        parameters=(Parameter("offset", "1", 0.0),), noises=(Noise("a", "1/s", 0.0),),
+        sensors=(Sensor("y", (Row("y", "1", 0.04),), h=both),),
+    )  # fmt: skip
+    model = joint(levels, {"offset": JointParameter(0.3, considered=True)})
+    log = Log.of(model, start=0.0)
+    log.add("y", [0.0, 0.0], [0.1, 0.2])
+    log.add_truth([0.0], a=[0.5], b=[0.25])
+    track = fold("ekf", model, log, covariance=True)
+    P, H = np.diag([1.0, 4.0, 0.09]), np.ones((1, 3))
+    for _ in range(2):
+        K = P @ H.T / (H @ P @ H.T + 0.04)
+        K[2] = 0.0
+        A = np.eye(3) - K @ H
+        P = A @ P @ A.T + 0.04 * K @ K.T
+    np.testing.assert_allclose(track.cov[-1], P[:2, :2], rtol=0, atol=1e-12)
+    error = np.array([0.5, 0.25]) - track.mean[-1]
+    assert track.nees().value == pytest.approx(error @ np.linalg.solve(P[:2, :2], error), rel=1e-9)
 
 
 def test_nees_is_its_definition():
