@@ -25,7 +25,7 @@ from ..model.state_space import StateSpaceModel
 from ..numerics.jit import floats, jit, matrix
 from ..numerics.peaks import peaks_of
 from ..numerics.random import key_of, normal
-from ..track import FAILED, GATED, MISSING, USED
+from ..track import FAILED, MISSING, USED
 from .cloud import (
     MAX_POINTS,
     PROCESS,
@@ -175,11 +175,12 @@ def update(context, u, sensor, y, index, state, work, innovation, innovation_std
     verdict = admit(context, sensor, m, shared.nu, shared.S, shared.U, score)
     score_rows(context, sensor, y, shared, score)
     state[SETTLED] = settled
+    score[2] = np.nan
     if verdict == USED:
         sweep(ADOPT, context, u, 0.0, sensor, y, NO_KEY, 0.0, state, work)
     log_sum = normalise(context, state, work)
-    if verdict != GATED:
-        score[2] = log_sum if log_sum > -np.inf else np.nan
+    if log_sum > -np.inf:
+        score[2] = log_sum
     if verdict == USED and log_sum > -np.inf:
         keep_or_resample(context, key_of(context.seed, index, RESAMPLE), log_sum, state, work)
         reconsider(context, index, state)
