@@ -163,7 +163,7 @@ class Estimator:
     @property
     def marginal(self) -> bool:
         """Whether its predictions are not Gaussian, so that `Track.whitened` holds each row by itself."""
-        return self.samples and not self.interpreted
+        return self.family in ("particle", "ensemble")
 
     def complete(self, options: Mapping[str, float | str]) -> dict[str, float]:
         """Return the given options and the defaults of the others; a choice may be given as its word.
