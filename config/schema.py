@@ -454,6 +454,9 @@ class TwinSection(Section):
     withhold: dict[str, Positive] = {}
     """Half-width of the 95 % band of a state beyond which its estimate is withheld, in its unit, for example
     {soc: 0.2}: page, API and files then show the reason in place of a value. Default: never."""
+    watched: Annotated[tuple[Text, ...], Field(min_length=1)] | None = None
+    """States that somebody acts on: one whose corrections over its memory are too large makes the twin suspect, any
+    other only itself. Default: all but parameters and errors that are estimated."""
     estimator: Annotated[
         EstimatorSection, BeforeValidator(as_estimator, json_schema_input_type=str | EstimatorSection)
     ] = EstimatorSection(name="ekf")

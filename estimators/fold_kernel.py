@@ -10,8 +10,10 @@ from numba import types
 
 from .compiled.context import context_at, context_type, prior, sensor_rows, steps_of
 from .compiled.verdict import limit_of
+from .diagnostics.detector_state import row_part
 from .diagnostics.detector_watch import watch_rows
 from .diagnostics.health import NORMALS, assess, bounds_type, policy_type
+from .diagnostics.memory import after_update, before_update, carry_memory, forget_memory, memory_flags
 from .estimator import call_describe, call_predict, call_start, call_update, code_type
 from .gate.rejection_runs import forget, note, rule_type
 from .gate.soften import soften
@@ -23,10 +25,11 @@ from .track import ANCESTORS, EFFECTIVE, GATED, MISSING, NONE, SCREENED, USED, W
 
 
 @embedded
-def advance_to(code, context, u, clock, t, index, state, work):
+def advance_to(code, context, u, clock, t, index, state, work, memory=0):
     """Predict from the clock to time t, in steps of at most `max_step`.
 
-    After a time of more than `MAX_PREDICT_STEPS` steps the state is reset to the prior.
+    After a time of more than `MAX_PREDICT_STEPS` steps the state is reset to the prior. `memory` is the address of the
+    memory of the states (`diagnostics/memory.py`), or 0.
     """
     if clock == UNSET or t <= clock:
         return
@@ -34,9 +37,13 @@ def advance_to(code, context, u, clock, t, index, state, work):
     if dt > MAX_PREDICT_STEPS * context.max_step:
         prior_mean, prior_cov = prior(context)
         call_start(code.start, context, prior_mean, prior_cov, state)
+        if memory != 0:
+            forget_memory(memory, context.nx)
         return
     steps = steps_of(dt, context.max_step)
     for _ in range(steps):
+        if memory != 0:
+            carry_memory(context, memory, state[: context.nx], u, dt / steps)
         call_predict(code.predict, context, u, dt / steps, index, state, work)
 
 
@@ -58,7 +65,7 @@ def exchange(r, own, kept):
 @embedded
 def fold_event(
     code, context, rule, i, index, start, t, kind, channel, value, width,
-    clock, u, state, doubt, edge, spare, work, score, track, kept, passed,
+    clock, u, state, doubt, edge, spare, work, score, track, kept, passed, memory,
 ):  # fmt: skip
     """Fold event i, of absolute index `index`, into row i of the track; see `run`.
 
@@ -87,7 +94,7 @@ def fold_event(
     verdict = NONE
     asked = False
     if what == READING or what == INPUT:
-        advance_to(code, context, u, clock[0], t[i], index, state, work)
+        advance_to(code, context, u, clock[0], t[i], index, state, work, memory)
         clock[0] = t[i]
         if what == INPUT:
             for j in range(nu):
@@ -105,6 +112,8 @@ def fold_event(
             if screen_reading(i, t[i], sensor, given, context, edge, screened):
                 left = pass_on(value, screened, i, passed)
                 given = passed
+            if memory != 0:
+                before_update(context, memory, state)
             if left:
                 verdict = call_update(
                     code.update,
@@ -136,6 +145,8 @@ def fold_event(
             if variances:
                 for k in range(rows):
                     r[k] = kept[k]
+            if memory != 0 and verdict == USED:
+                after_update(context, memory, state)
             if verdict == GATED or verdict == USED:
                 beyond = score[0] > limit_of(context, sensor, int(score[1]))
                 asked = note(doubt[sensor], rule.most, beyond, index, float(t[i]))
@@ -143,6 +154,8 @@ def fold_event(
     elif what == RESET:
         prior_mean, prior_cov = prior(context)
         call_start(code.start, context, prior_mean, prior_cov, state)
+        if memory != 0:
+            forget_memory(memory, context.nx)
         forget(doubt)
         clock[0] = t[i]
         call_describe(code.describe, context, state, mean[i], std[i], cross[i])
@@ -161,6 +174,7 @@ def fold_event(
     track.verdict[i] = verdict
     track.effective[i] = score[EFFECTIVE]
     track.ancestors[i] = score[ANCESTORS]
+    track.flags[i] = memory_flags(memory, context.nx) if memory != 0 else 0
     for j in range(whitened.shape[1]):
         whitened[i, j] = score[WHITENED + j]
     return asked
@@ -170,7 +184,7 @@ def fold_event(
 @jit
 def run(
     code, context, rule, first, start, end, t, kind, channel, value, width,
-    clock, u, state, doubt, edge, spare, work, score, track, kept, passed,
+    clock, u, state, doubt, edge, spare, work, score, track, kept, passed, memory,
 ):  # fmt: skip
     """Fold events `start` to `end`: update clock (1,), u (nu,) and state in place, and fill one track row per event.
 
@@ -180,7 +194,7 @@ def run(
     A tick, a truth or a mark is a query: it is answered from a copy of the state, so it never changes the estimate.
     Variances of a measurement (columns of `value` from `width` on) replace the tuned R while it is folded, in every
     filter. Rows that are rejected before the filter are NaN for it; without any row left it only predicts. kept (rows,)
-    and passed (columns of `value`,) are scratch.
+    and passed (columns of `value`,) are scratch; `memory` is the address of the memory of the states, or 0.
     """
     t, kind, channel, value = borrowed(t), borrowed(kind), borrowed(channel), borrowed(value)
     clock, u, state, doubt = borrowed(clock), borrowed(u), borrowed(state), borrowed(doubt)
@@ -189,7 +203,7 @@ def run(
     for i in range(start, end):
         asked = fold_event(
             code, context, rule, i, first + i, start, t, kind, channel, value, width,
-            clock, u, state, doubt, edge, spare, work, score, track, kept, passed,
+            clock, u, state, doubt, edge, spare, work, score, track, kept, passed, memory,
         )  # fmt: skip
         if asked:
             return i
@@ -235,10 +249,13 @@ def run_and_judge(
     context = context_at(context_place)
     kept = np.empty(context.n_rows if value.shape[1] > width else 0)
     passed = np.empty(value.shape[1])
+    memory = row_part(evidence, context.n_sensors, context.n_rows).ctypes.data
+    if context.memory == 0 or policy.window == 0:
+        memory = 0
     for k in range(stops.size):
         asking = run(
             code, context, rule, first, start, stops[k], t, kind, channel, value, width,
-            clock, u, state, doubt, edge, spare, work, score, track, kept, passed,
+            clock, u, state, doubt, edge, spare, work, score, track, kept, passed, memory,
         )  # fmt: skip
         end = stops[k] if asking < 0 else asking + 1
         if policy.window > 0:
@@ -256,7 +273,7 @@ _log = (I1, B1, I4, F2)
 begin_signature = types.void(code_type, context_type, F1, F2, F1)
 judge_signature = types.void(i64, i64, *_log, context_type, policy_type, bounds_type, F1, track_type)
 _state = I1, F1, F1, F2, F1, F1, F1, F1, track_type
-run_signature = i64(code_type, context_type, rule_type, i64, i64, i64, *_log, i64, *_state, F1, F1)
+run_signature = i64(code_type, context_type, rule_type, i64, i64, i64, *_log, i64, *_state, F1, F1, i64)
 run_and_judge_signature = i64(
     code_type, i64, rule_type, i64, i64, I1, *_log, i64, *_state, policy_type, bounds_type, F1, I1
 )

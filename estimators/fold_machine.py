@@ -14,6 +14,7 @@ from .compiled.jacobians import constant_rows, scratch_size, sensor_jacobian
 from .compiled.model import compile_model
 from .diagnostics.detector_state import detector_context, fresh, no_baseline
 from .diagnostics.health import Bounds, HealthPolicy, chi_square_bounds
+from .diagnostics.memory import fresh_memory, memory_context
 from .errors import ModelError
 from .estimator import Code, Estimator, Options
 from .events.maintenance import without
@@ -122,6 +123,7 @@ class Machine:
             "n_baseline": own["baseline"].size,
             "width": model.width,
             "seed": tuning.seed,
+            **memory_context(self.estimator, model),
         }
         plain = {k: v.ctypes.data if isinstance(v, np.ndarray) else v for k, v in self.held.items()}
         return context_of(**plain, **sizes)
@@ -149,7 +151,7 @@ class Machine:
             clock=np.array([UNSET]),
             u=model.default_inputs.copy(),
             state=np.empty(numbers),
-            evidence=fresh(model),
+            evidence=fresh(model, fresh_memory(model) if self._seen["memory"] else None),
             edge=fresh_screen(model),
             doubt=doubt.fresh(len(model.sensors)),
         )

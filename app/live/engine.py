@@ -18,7 +18,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from estimators.diagnostics.references import withheld_reasons
+from estimators.diagnostics.references import own_grades
 from estimators.errors import NisusError
 from estimators.late import inflated
 from estimators.log import INPUT, READING, TICK, Events
@@ -300,7 +300,7 @@ class Engine(Running):
             mean=row.mean[0],
             std=row.std[0],
             inputs=u,
-            withheld=withheld_reasons(self.model, row, u),
+            grades=own_grades(self.model, row, u),
         )
         return self._with_lag(latest)
 

@@ -14,6 +14,7 @@ from estimators.diagnostics.clock_fit import ClockFit
 from estimators.diagnostics.consistency import NisVerdict
 from estimators.diagnostics.field_pictures import Picture
 from estimators.diagnostics.health import HealthPolicy
+from estimators.diagnostics.references import withheld_reasons
 from estimators.diagnostics.sensitivity import Bound, Smallest
 from estimators.fold import Fold
 from estimators.log import Events, Log
@@ -238,8 +239,8 @@ class Status:
     filter's own figures (see `Fold.account`). `latency_ms` is the 99th percentile from a measurement's arrival to its
     row. `faults` are the injected ones that are active or planned. `integrity` has the protection levels; None until
     they are known. `compiling` are the filters that are not compiled yet: seconds since each was begun, None for one
-    that waits; `awaited` is the one for which a refold waits. `withheld` has the reason of each state whose estimate
-    is withheld. `nis` is the verdict on the last window, `sensor_nis`
+    that waits; `awaited` is the one for which a refold waits. `grades` has grade and reason of each state that has its
+    own (see `own_grades`). `nis` is the verdict on the last window, `sensor_nis`
     (sensors,) the mean NIS per degree of freedom of each sensor's recent measurements, `sensor_rows` (sensors,
     verdicts) how many have which verdict. `heard` is the monotonic time at which the last event arrived, s; `mean` and
     `std` (shown states,) and `inputs` (nu,) are those after it.
@@ -274,10 +275,15 @@ class Status:
     integrity: ProtectionLevels | None = None
     awaited: str | None = None
     compiling: Mapping[str, float | None] = field(default_factory=dict)
-    withheld: Mapping[str, str] = field(default_factory=dict)
+    grades: Mapping[str, tuple[str, str]] = field(default_factory=dict)
     sensor_nis: np.ndarray = field(default_factory=lambda: np.zeros(0))
     sensor_rows: np.ndarray = field(default_factory=lambda: np.zeros((0, 0), np.int64))
     heard: float = 0.0
     mean: np.ndarray = field(default_factory=lambda: np.zeros(0))
     std: np.ndarray = field(default_factory=lambda: np.zeros(0))
     inputs: np.ndarray = field(default_factory=lambda: np.zeros(0))
+
+    @property
+    def withheld(self) -> dict[str, str]:
+        """The reason of each state whose estimate is withheld."""
+        return withheld_reasons(self.grades)

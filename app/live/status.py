@@ -11,7 +11,7 @@ import numpy as np
 from estimators.diagnostics.consistency import NisVerdict
 from estimators.diagnostics.detector_state import SENSOR_STATES, sensor_states, sensor_states_over_time
 from estimators.diagnostics.health import MAX_ROWS_PER_READING, HealthPolicy
-from estimators.diagnostics.references import withheld_reasons
+from estimators.diagnostics.references import own_grades
 from estimators.diagnostics.score import nis_verdict
 from estimators.fold import Fold
 from estimators.log import INPUT, RESET, Events, model_version_at
@@ -87,7 +87,7 @@ def status_of(
         account=fold.account(),
         nis=nis,
         sensor_nis=_nis_of_sensors(log.events.select(slice(0, fold.n)), track, len(model.sensors)),
-        withheld=withheld_reasons(model, track, fold.u) if last >= 0 else {},
+        grades=own_grades(model, track, fold.u) if last >= 0 else {},
         latency_ms=watchers.latency.percentile(99.0),
         latency_p50_ms=watchers.latency.percentile(50.0),
         integrity=watchers.integrity.of(fields["revision"]),
@@ -160,7 +160,7 @@ def past_status(engine: Running, watchers: Watchers, t: int) -> Status:
         episodes_open=len(account.lasting),
         lost=None if estimated_rows(track.select(slice(-1, None)))[0] else now,
         nis=nis,
-        withheld=withheld_reasons(model, track, inputs),
+        grades=own_grades(model, track, inputs),
         sensor_nis=sensor_nis,
         mean=track.mean[-1].copy(),
         std=track.std[-1].copy(),

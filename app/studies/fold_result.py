@@ -25,7 +25,7 @@ from estimators.diagnostics.consistency import nees
 from estimators.diagnostics.detectors import detector_of
 from estimators.diagnostics.episodes import Episode, episode_json
 from estimators.diagnostics.failure_cause import failures
-from estimators.diagnostics.references import WITHHELD, state_grades, withheld, withheld_reasons
+from estimators.diagnostics.references import own_grades, state_grades, state_health, withheld, withheld_reasons
 from estimators.diagnostics.score import Fit, Score, health_of, score
 from estimators.diagnostics.sensitivity.suspects import Suspect, in_words, isolates, likeliest, odds, suspects
 from estimators.errors import NisusError
@@ -296,7 +296,7 @@ def fold_json(result: FoldResult) -> dict[str, Any]:
 def _withheld(result: FoldResult) -> dict[str, dict[str, Any]]:
     """Return share and reason of withheld estimates, by state."""
     model, track = result.twin.model, result.track
-    reasons = withheld_reasons(model, track, result.fold.u) if len(track) else {}
+    reasons = withheld_reasons(own_grades(model, track, result.fold.u)) if len(track) else {}
     shares = withheld(model, track).mean(axis=0) if len(track) else np.zeros(len(model.shown_states))
     return {
         state.name: {"share": share, "reason": reasons.get(state.name)}
@@ -314,15 +314,15 @@ def _grades(result: FoldResult) -> dict[str, dict[str, Any]]:
     leading = min(lasting, key=lambda episode: detector_of(episode.cause).severity, default=None)
     health = int(track.health[-1])
     cause = leading.text if leading is not None and health != TRACKING else ""
-    grades = state_grades(model, withheld_reasons(model, track, result.fold.u), health, cause)
-    hidden, own = withheld(model, track), health_of(events, track, policy)
+    grades = state_grades(model, own_grades(model, track, result.fold.u), health, cause)
+    hidden, healths = withheld(model, track), (state_health(track, j) for j in range(len(grades)))
     return {
         name: {
             "grade": grade,
             "reason": reason,
-            "share": health_of(events, track, policy, hidden[:, j]) if hidden[:, j].any() else {**own, WITHHELD: 0.0},
+            "share": health_of(events, track._replace(health=health), policy, own),
         }
-        for j, (name, (grade, reason)) in enumerate(grades.items())
+        for (name, (grade, reason)), own, health in zip(grades.items(), hidden.T, healths, strict=True)
     }
 
 

@@ -143,6 +143,7 @@ def configure(model: StateSpaceModel, loaded: Loaded) -> StateSpaceModel:
     places = [*states, *(item.name for item in model.inputs)]
     check_names(loaded, ("valid",), config.valid, places, "state or input", model)
     check_names(loaded, ("withhold",), config.withhold, states, "state", model)
+    check_named(loaded, ("watched",), config.watched or (), model)
     own = states[: model.nx - model.considered]
     for name in states[len(own) :]:
         if name in config.prior:
@@ -341,6 +342,7 @@ def _states(model: StateSpaceModel, loaded: Loaded) -> Sequence[State]:
                 mean=state.mean if mean is None else mean,
                 std=state.std if std is None else std,
                 withhold=loaded.config.withhold.get(state.name, state.withhold),
+                watched=state.name in (loaded.config.watched or (state.name,)),
             )
         )
     return _ranged(tuple(found), loaded)
@@ -348,12 +350,16 @@ def _states(model: StateSpaceModel, loaded: Loaded) -> Sequence[State]:
 
 def _ranged(items: Any, loaded: Loaded) -> Any:
     """Return states or inputs with the YAML's ranges of validity; a field stays."""
-    given = loaded.config.valid
+    given, widen = loaded.config.valid, [section.widen for section in loaded.config.parameters.values()]
     if isinstance(items, Field):
         return items
+    found = (
+        replace(item, far=max((own[item.name].per for own in widen if item.name in own), default=None))
+        for item in items
+    )
     return tuple(
         replace(item, fitted=bounds((given[item.name].min, given[item.name].max))) if item.name in given else item
-        for item in items
+        for item in found
     )
 
 

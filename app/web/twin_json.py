@@ -60,9 +60,7 @@ def status_json(engine: Running, status: Status | None = None) -> dict[str, Any]
         "health": HEALTH_NAMES[status.health],
         "states": {
             name: {"grade": grade, "reason": reason}
-            for name, (grade, reason) in state_grades(
-                engine.model, status.withheld, status.health, status.cause
-            ).items()
+            for name, (grade, reason) in state_grades(engine.model, status.grades, status.health, status.cause).items()
         },
         **nis_json(status.nis),
         "late": {"inflate": twin.late.inflate, "reason": twin.late.reason},

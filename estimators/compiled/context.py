@@ -64,6 +64,7 @@ _FIELDS = """
     prior_mean prior_cov prior_rows n_considered linear_states n_linear sampled_states n_sampled jump mode n_modes
     p q r used gate width options n_options pairs n_pairs shown n_shown prepared n_prepared seed
     baseline n_baseline normal ranges fitted expected chances gated marginal n_tests limits limited duplicates
+    memory graded unwatched
 """.split()
 
 _layout = np.dtype([(name, np.float64 if name == "max_step" else np.int64) for name in _FIELDS])

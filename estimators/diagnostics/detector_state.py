@@ -7,10 +7,21 @@ from typing import Any
 import numpy as np
 
 from ..events.batch import READING, Events
-from ..model.state_space import StateSpaceModel
+from ..model.state_space import Input, State, StateSpaceModel
 from ..numerics.jit import floats, inlined, part
 from ..track import HELD_OUT, MISSING, Track
-from .detectors import ADVISORY_ALARM, AT_REPETITION, GAINS, JOINT, LOST, REJECTED_SHARE, SENSOR_FLAGS, TESTS
+from .detectors import (
+    ADVISORY_ALARM,
+    AT_REPETITION,
+    FAR,
+    GAINS,
+    JOINT,
+    LOST,
+    REJECTED_SHARE,
+    SENSOR_FLAGS,
+    TESTS,
+    beyond_range,
+)
 from .health import HealthPolicy, normal_nis
 
 # Twin: rows in alarm, of which the bands are valid and wider than necessary; rows lost; time at which the next sensor
@@ -25,17 +36,19 @@ TWIN = 10
 COUNT, FIRST, LAST, LONGEST_GAP, THRESHOLD, DUE, SILENT, JOINT_MASK = range(JOINT, JOINT + 8)
 SENSOR = JOINT + 8  # Numbers in the state for each sensor
 
-# Row: W of its tests, then its alarms; the last e, and the same whitened by the baseline; the last value; its smallest
-# step; length of the present run of equal values; repeated values, of how many; measurements since the last outlier;
-# mean and mean square of the recent e that are no outliers, and their number; grade of the alarms (0, `ADVISED` or
-# `ACTED_ON`); innovation that is left after the last update, and its variance; movement that was predicted during the
-# present run, the sum of squares of its steps, and their predicted variance; standard deviation of the last prediction,
-# of that before a reset, and measurements until the tests begin again after it; the next e that each filter of `GAINS`
-# predicts. The inputs that hold follow.
+# Row: W of its tests, then its alarms; the last e, and the same whitened by the baseline; the last value; its
+# smallest step; length of the present run of equal values; repeated values, of how many; measurements since the last
+# outlier; mean and mean square of the recent e that are no outliers, and their number; grade of the alarms (0,
+# `ADVISED` or `ACTED_ON`); innovation that is left after the last update, and its variance; movement that was
+# predicted during the present run, the sum of squares of its steps, and their predicted variance; standard deviation
+# of the last prediction, of that before a reset, and measurements until the tests begin again after it; the next e
+# that each filter of `GAINS` predicts; the share of recent measurements outside their bands, and the number of these.
+# The memory of the states, if it is followed, and the inputs that hold come after the rows.
 MASK, RAW, WHITE, VALUE, QUANTUM, RUN, EQUAL, COUNTED = range(TESTS, TESTS + 8)
 CALM_FOR, MEAN_E, SQUARE_E, KNOWN, GRADE, LEFT, LEFT_VARIANCE = range(TESTS + 8, TESTS + 15)
 MOVED, MOVED_SQUARES, MOVED_VARIANCE, LAST_STD, STD_BEFORE, RESETTING, EXPECTED = range(TESTS + 15, TESTS + 22)
-ROW = EXPECTED + len(GAINS)  # Numbers in the state for each row
+OUT, COUNTED_OUT = EXPECTED + len(GAINS), EXPECTED + len(GAINS) + 1
+ROW = EXPECTED + len(GAINS) + 2  # Numbers in the state for each row
 
 ADVISED, ACTED_ON = 1.0, 2.0
 
@@ -71,25 +84,25 @@ def detector_context(
         expected: Sensors that must report, (sensors,); None for those that have reported.
 
     Returns:
-        `baseline` (rows, 3 + TESTS); `normal` (sensors, 3), see `normal_nis`; `ranges` (shown + inputs, 5), in which
-        the model was fitted, whether bands widen outside, and physical limits; `fitted`, 1 if there is any; `expected`
-        (sensors,);
+        `baseline` (rows, 3 + TESTS); `normal` (sensors, 3), see `normal_nis`; `ranges` (shown + inputs, 3, 2), in
+        which the model was fitted, with `MARGIN` and as far as `FAR`, and physical limits; `fitted`, 1 if there is any;
+        `expected` (sensors,);
         `chances` (2,), log Λ of a rejected and of an accepted measurement; `gated`, whether outliers are rejected;
         `marginal`; `n_tests` in all.
     """
-    ranges = np.full((len(model.shown) + model.nu, 5), [-np.inf, np.inf, 0.0, -np.inf, np.inf])
+    ranges = np.full((len(model.shown) + model.nu, 3, 2), [-np.inf, np.inf])
     for k, state in enumerate(model.shown_states):
-        ranges[k, 3:] = state.limits or ranges[k, 3:]
-    fitted = [(item.fitted, item.widens) for item in model.shown_states]
-    for k, (limits, widens) in enumerate(fitted + [(item.fitted, item.widens) for item in model.inputs]):
-        if limits is not None:
-            ranges[k, :3] = *limits, widens
+        ranges[k, 2] = state.limits or ranges[k, 2]
+    items: tuple[State | Input, ...] = (*model.shown_states, *model.inputs)
+    for own, item in zip(ranges, items, strict=True):
+        if item.fitted is not None:
+            own[:2] = beyond_range(item.fitted), beyond_range(item.fitted, FAR, item.far)
     counts = np.array([len(sensor.rows) for sensor in model.sensors], np.int64)
     return {
         "baseline": np.ascontiguousarray(baseline, float),
         "normal": normal_nis(model, baseline),
         "ranges": ranges,
-        "fitted": int(np.any(np.isfinite(ranges[:, [0, 1, 3, 4]]))),
+        "fitted": int(np.any(np.isfinite(ranges))),
         "expected": np.zeros(len(counts), np.int64) if expected is None else np.ascontiguousarray(expected, np.int64),
         "chances": gate_log_ratios(gate),
         "gated": int(gate is not None),
@@ -109,15 +122,14 @@ def threshold_of(model: StateSpaceModel, state: np.ndarray, s: int) -> float:
     return float(state[TWIN + s * SENSOR + THRESHOLD])
 
 
-def fresh(model: StateSpaceModel) -> np.ndarray:
-    """Return the state before the first event."""
+def fresh(model: StateSpaceModel, memory: np.ndarray | None = None) -> np.ndarray:
+    """Return the state before the first event, with that of the states' memory (`memory.py`) if it is followed."""
     rows, sensors = len(model.row_names), len(model.sensors)
-    state = np.zeros(TWIN + sensors * SENSOR + rows * ROW + model.nu)
+    state = np.zeros(TWIN + sensors * SENSOR + rows * ROW)
     state[NEXT_DUE], state[BEGUN] = np.inf, np.nan
     _sensors(model, state)[:, DUE] = np.inf
     _rows(model, state)[:, [RAW, WHITE, VALUE, LEFT]] = np.nan
-    state[state.size - model.nu :] = model.default_inputs
-    return state
+    return np.concatenate((state, () if memory is None else memory, model.default_inputs))
 
 
 def _sensors(model: StateSpaceModel, state: np.ndarray) -> np.ndarray:

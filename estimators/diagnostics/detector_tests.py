@@ -32,6 +32,7 @@ from .detector_state import (
     CALM_FOR,
     COUNT,
     COUNTED,
+    COUNTED_OUT,
     DUE,
     EQUAL,
     EXPECTED,
@@ -47,6 +48,7 @@ from .detector_state import (
     MOVED_SQUARES,
     MOVED_VARIANCE,
     NEXT_DUE,
+    OUT,
     QUANTUM,
     RAW,
     RESETTING,
@@ -94,6 +96,7 @@ from .detectors import (
     TESTS,
     UNKNOWN_QUANTUM,
 )
+from .references import HALF_WIDTH
 
 COEFFICIENTS = np.ascontiguousarray(RATIOS.T)
 """`RATIOS` by coefficient, (5, QUADRATIC)."""
@@ -120,6 +123,9 @@ PRIOR_MEASUREMENTS, RECENT_MEASUREMENTS = 20.0, 200.0
 WIDE_SQUARE, COVERED_SQUARE, NORMAL_SQUARE = 0.8, 0.95, 1.3
 """Mean square of the recent e below which bands are wider than necessary, below which they cover the measurements, and
 below which they are not too narrow."""
+
+COVERED_S, COVERED_READINGS, COVERED, ONE_SIDED = 600.0, 100.0, 0.9, 1.645
+"""Seconds, and at least so many measurements, of which this share must credibly (95 %) lie in the 95 % bands."""
 
 FOLLOWING_SHARE = 0.5  # Share of the estimate's variance in S from which on the estimate follows each measurement
 
@@ -247,14 +253,31 @@ def weigh(own, e, h, base, before):
 
 
 @inlined
+def note_coverage(own, e, sensor):
+    """Note whether a measurement of a sensor lies in its band, of those of the last `COVERED_S` seconds."""
+    period = (sensor[LAST] - sensor[FIRST]) / sensor[COUNT]
+    most = max(COVERED_READINGS, COVERED_S / max(period, 1e-6))
+    own[COUNTED_OUT] = min(own[COUNTED_OUT] + 1.0, most)
+    own[OUT] += ((1.0 if abs(e) > HALF_WIDTH else 0.0) - own[OUT]) / own[COUNTED_OUT]
+
+
+@inlined
+def _covers(own):
+    """Return whether it is credible that 90 % of the measurements lie in their bands, or too few are known."""
+    n, share = own[COUNTED_OUT], own[OUT]
+    return n < COVERED_READINGS or share - ONE_SIDED * math.sqrt(share * (1.0 - share) / n) <= 1.0 - COVERED
+
+
+@inlined
 def grade(own, mask, gated, r):
     """Return the grade of the alarms of a row: 0 for none, `ADVISED` if its bands are valid, else `ACTED_ON`.
 
-    Valid are bands that are too wide. They cover a correlation of e, which tests of unit variance also see where e is
-    merely small, if its mean square is small and its mean μ within the band of the estimate itself, μ² ≤ (S - R) / S:
-    an estimate that averages many measurements has a narrow band, however wide that of a measurement is. They cover
-    μ ≠ 0 only where the estimate follows each measurement, so that no error accumulates. Valid, too, is an estimate
-    from which a gate keeps the outliers, if e has the right scale without them.
+    Valid are bands that are too wide, and those that hold most measurements (`_covers`) in spite of spikes, of a scale
+    that is a little too small, and of a sign that alternates. They cover a correlation of e, which tests of unit
+    variance also see where e is merely small, if its mean square is small and its mean μ within the band of the
+    estimate itself, μ² ≤ (S - R) / S: an estimate that averages many measurements has a narrow band, however wide that
+    of a measurement is. They cover μ ≠ 0 only where the estimate follows each measurement, so that no error
+    accumulates. Valid, too, is an estimate from which a gate keeps the outliers, if e has the right scale without them.
     """
     if mask == 0:
         return 0.0
@@ -263,6 +286,8 @@ def grade(own, mask, gated, r):
         rest &= ~SPIKY
         if 1.0 + own[SQUARE_E] < NORMAL_SQUARE:
             rest &= ~NARROW
+    if _covers(own):
+        rest &= ~(NARROW | SPIKY | ALTERNATING)
     if rest & (SHIFTED | LAGGING) != 0:
         variance, mean, square = own[LAST_STD] * own[LAST_STD], own[MEAN_E], 1.0 + own[SQUARE_E]
         if mean * mean * variance <= variance - r:

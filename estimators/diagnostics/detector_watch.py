@@ -46,19 +46,31 @@ from .detector_state import (
     row_part,
     sensor_part,
 )
-from .detector_tests import add, alarm, find_dropouts, grade, note_time, repeat, resetting, weigh, weigh_joint
+from .detector_tests import (
+    add,
+    alarm,
+    find_dropouts,
+    grade,
+    note_coverage,
+    note_time,
+    repeat,
+    resetting,
+    weigh,
+    weigh_joint,
+)
 from .detectors import (
     ADVISORY_ALARM,
     AGREEING,
     AT_REFUSALS,
     DISAGREEING,
+    FAR_OUTSIDE,
     IMPOSSIBLE,
     IMPOVERISHED,
     LOST,
     OUTSIDE,
-    OUTSIDE_WIDENED,
     REFUSED,
     SENSOR_FLAGS,
+    SENSOR_MASK,
     STUCK,
     TESTS,
 )
@@ -139,6 +151,7 @@ def _test(i, now, y, s, context, policy, state, track):
             if context.marginal == 0:
                 e = innovation / std
             if np.isfinite(e):
+                note_coverage(each, e, own)
                 mask = mask & LOST | weigh(each, e, h, base, before)
         if k == 0:
             mask = mask & ~(DISAGREEING | AGREEING) | int(own[JOINT_MASK])
@@ -168,17 +181,19 @@ def _count_particles(effective, ancestors, state):
 def _range(i, u, context, track):
     """Return the flags of states and inputs outside the range in which the model was fitted, or beyond all limits."""
     states = track.mean.shape[1]
-    ranges = floats(context.ranges, 5 * (states + u.size))
+    ranges = floats(context.ranges, 6 * (states + u.size))
     found = 0
     for k in range(states + u.size):
         value = track.mean[i, k] if k < states else u[k - states]
-        own = ranges[5 * k : 5 * k + 5]
+        own = ranges[6 * k : 6 * k + 6]
         if value < own[0] or value > own[1]:
-            found |= OUTSIDE if own[2] == 0.0 else OUTSIDE_WIDENED
+            found |= OUTSIDE
+        if value < own[2] or value > own[3]:
+            found |= FAR_OUTSIDE
         half = HALF_WIDTH * track.std[i, k] if k < states else 0.0
-        if value + half < own[3] or value - half > own[4]:
+        if value + half < own[4] or value - half > own[5]:
             found |= IMPOSSIBLE
-    return found & ~OUTSIDE_WIDENED if found & OUTSIDE != 0 else found
+    return found
 
 
 @embedded
@@ -197,14 +212,17 @@ def _health(i, now, silent, flags, state, policy, track):
         return DIVERGED
     if track.age[i] > policy.degraded_after or silent != 0 or state[LOST_ROWS] > 0.0:
         return DEGRADED
-    if state[SUSPECT_ROWS] > 0.0 or flags & ~OUTSIDE_WIDENED != 0:
+    if state[SUSPECT_ROWS] > 0.0 or flags != 0:
         return SUSPECT
-    return ADVISORY if state[ADVISED_ROWS] > 0.0 or flags != 0 else TRACKING
+    return ADVISORY if state[ADVISED_ROWS] > 0.0 else TRACKING
 
 
 @embedded
 def watch_row(i, t, kind, channel, value, context, policy, state, track):
-    """Fill alarms, flags and health of row i of a track whose other columns are known; `state` evolves."""
+    """Fill alarms, flags (which hold those of the memory) and health of row i of a track whose other columns are known.
+
+    `state` evolves.
+    """
     sensors, rows, nu = context.n_sensors, context.n_rows, context.nu
     width = track.alarms.shape[1]
     expected = ints(context.expected, sensors)
@@ -237,17 +255,17 @@ def watch_row(i, t, kind, channel, value, context, policy, state, track):
         forget(state, sensors, rows, policy.window)
     if now > state[NEXT_DUE]:
         find_dropouts(state, sensors, now)
-    flags = 0
+    flags = track.flags[i]
     for s in range(sensors if state[SILENT_SENSORS] > 0.0 else 0):
         if sensor_part(state, s)[SILENT] != 0.0:
             flags |= 1 << min(s, SENSOR_FLAGS - 1)
-    silent = flags
+    silent = flags & SENSOR_MASK
     if context.fitted != 0:
         flags |= _range(i, u, context, track)
     if state[POOR_CLOUD] != 0.0:
         flags |= IMPOVERISHED
     track.flags[i] = flags
-    track.health[i] = _health(i, now, silent, flags, state, policy, track)
+    track.health[i] = _health(i, now, silent, flags & ~context.unwatched, state, policy, track)
 
 
 @part

@@ -276,6 +276,13 @@ DETECTORS = (
         effect="the value",
     ),
     Detector(
+        "corrected",
+        "{0.name} is corrected {0.since} by more than its band allows, over the time in which it forgets",
+        "the model or an input is wrong for it, which may lie outside its band; `nisus check` compares them",
+        statistic="sum of corrections that leave 20 to 90 % of the variance of a forecast, tested at variance 2.5",
+        effect="the value",
+    ),
+    Detector(
         "impoverished",
         "the particle cloud is impoverished {0.since}: {0.size:.3g} effective particles, all from {0.ancestors}",
         "use more particles, pf-ekf or pf-reg, or increase Q of the states that hardly move",
@@ -349,11 +356,28 @@ ADVISORY_ALARM = 1 << 30
 LOST = sum(detector.bits for detector in DETECTORS if detector.sensor_lost)
 """Alarms during which a sensor carries no information on the asset."""
 
-IMPOVERISHED, OUTSIDE, OUTSIDE_WIDENED, IMPOSSIBLE = 1 << 59, 1 << 60, 1 << 61, 1 << 62
+IMPOVERISHED, OUTSIDE, FAR_OUTSIDE, IMPOSSIBLE = 1 << 59, 1 << 60, 1 << 61, 1 << 62
 """Bits of `Track.flags` above those of the sensors that dropped out: few particles carry the estimate; outside the
-range in which the model was fitted; the same where the bands widen there."""
+range in which the model was fitted, and by half of it; an impossible estimate."""
 
-SENSOR_FLAGS = 58  # Sensors with a bit of their own in `Track.flags`; the others share the last
+MARGIN, FAR = 0.05, 0.5  # Share of its width by which a range is left before that counts, and before it is far
+
+
+def beyond_range(limits: tuple[float, float], share: float = MARGIN, far: float | None = None) -> tuple[float, float]:
+    """Return a range that is wider on both sides, by a share of its width or by a distance."""
+    more = share * (limits[1] - limits[0]) if far is None else far
+    return limits[0] - more, limits[1] + more
+
+
+SENSOR_FLAGS = 42  # Sensors with a bit of their own in `Track.flags`, the lowest; the others share the last
+SENSOR_MASK = (1 << SENSOR_FLAGS) - 1
+MEMORY_AT, MEMORY_FLAGS = SENSOR_FLAGS, 16  # First bit of the shown states, and how many of them have one
+
+
+def memory_flag(column: int) -> int:
+    """Return the bit of `Track.flags` of a shown state whose corrections are too large (memory.py), or 0."""
+    return 1 << MEMORY_AT + column if column < MEMORY_FLAGS else 0
+
 
 # What follows is compiled into the kernels as constants.
 

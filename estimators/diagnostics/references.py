@@ -11,7 +11,8 @@ from ..errors import spaced
 from ..events.batch import Events, truth_of
 from ..model.state_space import Input, State, StateSpaceModel
 from ..numerics.linalg import wrapped
-from ..track import HEALTH_NAMES, HELD_OUT, WAITING, Track
+from ..track import HEALTH_NAMES, HELD_OUT, SUSPECT, WAITING, Track
+from .detectors import FAR_OUTSIDE, memory_flag
 
 
 class Reference(NamedTuple):
@@ -60,9 +61,13 @@ HALF_WIDTH = 1.959963984540054  # Half-width of a 95 % band, in standard deviati
 
 
 def withheld(model: StateSpaceModel, track: Track) -> np.ndarray:
-    """Return where the estimate of a shown state is withheld, (n, shown): its 95 % band is wider than its limit."""
+    """Return where the estimate of a shown state is withheld, (n, shown).
+
+    Its 95 % band is wider than its limit, or the model is far outside the range in which it was fitted.
+    """
     limits = np.array([state.withhold for state in model.shown_states])
-    return track.std > limits / HALF_WIDTH
+    far = (track.flags & FAR_OUTSIDE != 0)[:, np.newaxis]
+    return (track.std > limits / HALF_WIDTH) | far & np.isfinite(limits)
 
 
 def shown_track(model: StateSpaceModel, track: Track) -> Track:
@@ -82,25 +87,32 @@ WITHHELD = "withheld"  # Grade of a state beside those of health
 
 
 def state_grades(
-    model: StateSpaceModel, reasons: Mapping[str, str], health: int, cause: str
+    model: StateSpaceModel, own: Mapping[str, tuple[str, str]], health: int, cause: str
 ) -> dict[str, tuple[str, str]]:
-    """Return grade and reason of each shown state: `WITHHELD`, or the health of the twin with its cause.
+    """Return grade and reason of each shown state: its own, or the health of the twin with its cause, if that is worse.
 
     Args:
         model: The model.
-        reasons: Those of `withheld_reasons`.
+        own: Those of `own_grades`.
         health: Health of the twin; before the first measurement nothing is withheld.
         cause: Its cause.
     """
-    own = HEALTH_NAMES[health], cause
+    twin = HEALTH_NAMES[health], cause
+    worse = [WITHHELD, HEALTH_NAMES[SUSPECT]] if health < SUSPECT else [WITHHELD]
     return {
-        state.name: (WITHHELD, reasons[state.name]) if state.name in reasons and health != WAITING else own
-        for state in model.shown_states
+        name: own[name] if health != WAITING and name in own and own[name][0] in worse else twin
+        for name in (state.name for state in model.shown_states)
     }
 
 
-def withheld_reasons(model: StateSpaceModel, track: Track, u: np.ndarray) -> dict[str, str]:
-    """Return why the last estimate of each withheld state is, in words, with its band.
+def state_health(track: Track, column: int) -> np.ndarray:
+    """Return the health of a shown state at each row, (n,): that of the twin, or suspect by itself."""
+    own = (track.flags & memory_flag(column) != 0) & (track.health != WAITING)
+    return np.where(own, np.maximum(track.health, SUSPECT), track.health)
+
+
+def own_grades(model: StateSpaceModel, track: Track, u: np.ndarray) -> dict[str, tuple[str, str]]:
+    """Return grade and reason of each state whose last estimate is withheld, or suspect by itself.
 
     Args:
         model: The model.
@@ -116,11 +128,21 @@ def withheld_reasons(model: StateSpaceModel, track: Track, u: np.ndarray) -> dic
         if limits is not None and not limits[0] <= value <= limits[1]
     ]
     why = f"outside the fitted range ({'; '.join(left)})" if left else "too uncertain"
-    return {
-        state.name: f"{why}, ± {_two_digits(HALF_WIDTH * deviation)}{spaced(state.unit)}"
+    grades = {
+        state.name: (HEALTH_NAMES[SUSPECT], "corrected over its memory by more than its band allows")
+        for k, state in enumerate(model.shown_states)
+        if track.flags[-1] & memory_flag(k)
+    }
+    return grades | {
+        state.name: (WITHHELD, f"{why}, ± {_two_digits(HALF_WIDTH * deviation)}{spaced(state.unit)}")
         for state, deviation, hidden in zip(model.shown_states, std, withheld(model, track)[-1], strict=True)
         if hidden
     }
+
+
+def withheld_reasons(own: Mapping[str, tuple[str, str]]) -> dict[str, str]:
+    """Return the reason of each withheld state among those of `own_grades`."""
+    return {name: reason for name, (grade, reason) in own.items() if grade == WITHHELD}
 
 
 def _two_digits(value: float) -> str:

@@ -342,7 +342,7 @@ def _fold_share(place, crew):
             copy(block.value[at], own_value[1])
             asks = fold_event(
                 code, context, rule, 1, n, 1, own_t, kind, channel, own_value, columns,
-                now.clock, now.u, now.filter, now.doubt, now.edge, spare, work, score, track, variances, passed,
+                now.clock, now.u, now.filter, now.doubt, now.edge, spare, work, score, track, variances, passed, 0,
             )  # fmt: skip
             if judges(track.verdict[1]):
                 slide(1, n, channel[1], block, normal, white, policy, bounds, terms, track)

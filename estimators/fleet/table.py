@@ -8,11 +8,10 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from ..diagnostics.detector_state import JOINT_MASK, MASK, ROW, SENSOR, TWIN
-from ..diagnostics.detectors import DETECTORS, IMPOSSIBLE, OUTSIDE, OUTSIDE_WIDENED, SENSOR_FLAGS, detector_of
+from ..diagnostics.detectors import DETECTORS, IMPOSSIBLE, OUTSIDE, SENSOR_MASK, detector_of
 from ..model.state_space import StateSpaceModel
 from ..track import DEGRADED, DIVERGED, HEALTH_NAMES, STALE
 
-SENSOR_MASK = (1 << SENSOR_FLAGS) - 1
 """Bits of the flags of sensors that dropped out."""
 
 
@@ -71,7 +70,7 @@ def _cause(mask: int, flags: int, health: int) -> str:
     """Return the name of the most severe detector in alarm, or ""."""
     causes = [detector.name for detector in DETECTORS if detector.bits & mask]
     causes += ["silent"] if flags & SENSOR_MASK else []
-    causes += ["outside"] if flags & (OUTSIDE | OUTSIDE_WIDENED) else []
+    causes += ["outside"] if flags & OUTSIDE else []
     causes += ["impossible"] if flags & IMPOSSIBLE else []
     causes += [HEALTH_NAMES[health]] if health in (STALE, DIVERGED) else []
     if health == DEGRADED and not any(detector_of(name).grade == HEALTH_NAMES[DEGRADED] for name in causes):

@@ -8,7 +8,15 @@ from typing import Any
 
 import numpy as np
 
-from ..diagnostics.detectors import ALARM_NAMES, IMPOSSIBLE, IMPOVERISHED, OUTSIDE, OUTSIDE_WIDENED, SENSOR_FLAGS
+from ..diagnostics.detectors import (
+    ALARM_NAMES,
+    FAR_OUTSIDE,
+    IMPOSSIBLE,
+    IMPOVERISHED,
+    OUTSIDE,
+    SENSOR_FLAGS,
+    memory_flag,
+)
 from ..diagnostics.episodes import Episode, episode_json
 from ..diagnostics.references import withheld
 from ..events.batch import KIND_NAMES, READING, Events, truth_of
@@ -83,6 +91,7 @@ def table_of(
         names = {1 << k: name for k, name in enumerate(shown)}
         columns["withheld"] = pa.array(_words(hidden @ np.array(list(names), np.int64), names), pa.string())
     bits = {1 << k: f"{name} silent" for k, name in enumerate(model.sensor_names[:SENSOR_FLAGS])} | _FLAGS
+    bits |= {memory_flag(k): f"{name} corrected" for k, name in enumerate(shown)}
     columns["flags"] = pa.array(_words(track.flags, bits), pa.string())
     plain = {k: np.ascontiguousarray(c) if isinstance(c, np.ndarray) else c for k, c in columns.items()}
     metadata = {"episodes": json.dumps([episode_json(episode) for episode in episodes])}
@@ -93,7 +102,7 @@ _CAUSES = {1 << k: cause for k, cause in enumerate(ALARM_NAMES)}
 _FLAGS = {
     IMPOVERISHED: "impoverished",
     OUTSIDE: "outside the fitted range",
-    OUTSIDE_WIDENED: "outside, bands widen",
+    FAR_OUTSIDE: "far outside the fitted range",
     IMPOSSIBLE: "impossible",
 }
 

@@ -89,6 +89,7 @@ def run(
             track.innovation_std[i] = np.nan
             score[:] = np.nan
             score[1] = 0.0
+            track.flags[i] = 0
             verdict = NONE
             asked = False
             told = state

@@ -180,13 +180,11 @@ def joint(
     low, high = (tuple(float(getattr(item, end)) for item in model.parameters) for end in ("low", "high"))
     layout = JointLayout(model.nx, place, low, high, _distances(model, widened, estimated))
     noises = tuple(Noise(item.name, f"{squared(item.unit)}/s", estimated[item.name].drift ** 2) for item in moved)
-    beyond = {name for item in widened for name in estimated[item.name].widened}
     found = replace(
         model,
-        inputs=tuple(replace(item, widens=item.name in beyond) for item in model.inputs),
         states=(
-            *(replace(item, widens=True) if item.name in beyond else item for item in model.states),
-            *(State(m.name, m.unit, m.value, estimated[m.name].std) for m in moved),
+            *model.states,
+            *(State(m.name, m.unit, m.value, estimated[m.name].std, appended=True) for m in moved),
             *(State(deviation(m.name), m.unit, 0.0, estimated[m.name].std) for m in considered),
             *(State(outside(m.name), "1", 0.0, 1.0) for m in widened),
         ),

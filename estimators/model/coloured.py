@@ -116,7 +116,7 @@ def coloured(
             driven = model.states[j]
             name = f"{noise.name}_disturbance" if len(found) == 1 else f"{noise.name}_{driven.name}_disturbance"
             std = float(np.sqrt(0.5 * noise.variance * share / over))
-            states.append(State(name, per_second(driven.unit), 0.0, std, position=driven.position))
+            states.append(State(name, per_second(driven.unit), 0.0, std, position=driven.position, appended=True))
             place.append((len(model.parameters) + len(parameters), k, share))
             along.append(b)
         parameters.append(_time(disturbance_time(noise.name), over))
@@ -127,7 +127,7 @@ def coloured(
         error = errors[sensor.name]
         first[sensor.name] = model.nx + len(states)
         for name, row, variance in zip(errors_of(sensor), sensor.rows, error.variance, strict=True):
-            states.append(State(name, row.unit, 0.0, float(np.sqrt(variance)), position=row.position))
+            states.append(State(name, row.unit, 0.0, float(np.sqrt(variance)), position=row.position, appended=True))
             place.append((len(model.parameters) + len(parameters), len(model.noises) + len(added), 1.0))
             added.append(Noise(name, squared(row.unit), variance))
         parameters.append(_time(error_time(sensor.name), error.over))

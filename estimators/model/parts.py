@@ -19,9 +19,11 @@ class State:
     """One entry of x with its prior N(mean, std²); a `circular` one is an angle in radians and wraps to ±π.
 
     `position` is for filters that localise measurements. `fitted` is the range in which the model was fitted or
-    checked; an estimate outside makes the twin suspect, or advisory if the bands widen there (`widens`). `withhold` is
-    the half-width of its 95 % band beyond which it is not shown as an estimate. `limits` are its physical limits: no
-    error is larger than the distance between them.
+    checked; an estimate outside makes the twin suspect. `withhold` is the half-width of its 95 % band beyond which it
+    is not shown as an estimate; nor is it where a state or an input is `far` or more outside its range (default: half
+    of its width). `limits` are its physical limits: no error is larger than the distance between them. An `appended`
+    one is a parameter or an error, whose corrections are not judged; a `watched` one makes the twin suspect when its
+    own corrections are too large.
     """
 
     name: str
@@ -31,9 +33,11 @@ class State:
     circular: bool = False
     position: tuple[float, ...] | None = None
     fitted: tuple[float, float] | None = None
-    widens: bool = False
     withhold: float = math.inf
+    far: float | None = None
     limits: tuple[float, float] | None = None
+    appended: bool = False
+    watched: bool = True
 
     def __post_init__(self) -> None:
         """Reject an empty range."""

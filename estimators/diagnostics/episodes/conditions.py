@@ -10,16 +10,16 @@ from ...log import INPUT
 from ...model.state_space import Input, State
 from ...track import DIVERGED, GATED, HEALTH_NAMES, SCREENED, STALE, WAITING
 from ..detectors import (
-    IMPOSSIBLE,
     IMPOVERISHED,
-    OUTSIDE,
-    OUTSIDE_WIDENED,
     REFUSED,
     SENSOR_FLAGS,
+    SENSOR_MASK,
     SHIFTED_DOWN,
     SHIFTED_UP,
     STUCK,
+    beyond_range,
     detector_of,
+    memory_flag,
 )
 from ..health import HealthPolicy
 from ..references import HALF_WIDTH
@@ -80,51 +80,55 @@ def _in_gap(t: np.ndarray, heard: np.ndarray) -> np.ndarray:
 
 
 def left_ranges(judged: JudgedRows) -> Iterator[FoundEpisode]:
-    """Yield shown states and inputs outside the range in which the model was fitted."""
+    """Yield shown states and inputs outside their fitted range, states that are impossible or corrected too much."""
     events, model, track = judged.events, judged.model, judged.track
     t = events.t
-    if not np.any(track.flags & (OUTSIDE | OUTSIDE_WIDENED | IMPOSSIBLE)):
+    if not np.any(track.flags & ~SENSOR_MASK):
         return
     for column, state in enumerate(model.shown_states):
         mean, half = track.mean[:, column], HALF_WIDTH * track.std[:, column]
-        yield from _outside(state, "outside", state.fitted, mean, mean, t)
-        yield from _outside(state, "impossible", state.limits, mean + half, mean - half, t)
+        yield from _outside(state, mean, t)
+        if state.limits is not None:
+            low, high = state.limits
+            yield from _beyond(state, "impossible", (mean + half < low) | (mean - half > high), mean, t, state.limits)
+        for found in _beyond(state, "corrected", track.flags & memory_flag(column) != 0, mean, t):
+            grade = found.episode.grade if state.watched else "advisory"
+            yield found._replace(episode=found.episode._replace(grade=grade))
     rows = np.flatnonzero(events.kind == INPUT)
     for j, item in enumerate(model.inputs):
         value = events.value[rows, j]
         known = np.isfinite(value)
-        yield from _outside(item, "outside", item.fitted, value[known], value[known], t[rows[known]])
+        yield from _outside(item, value[known], t[rows[known]])
 
 
-def _outside(
+def _outside(item: State | Input, value: np.ndarray, t: np.ndarray) -> Iterator[FoundEpisode]:
+    if item.fitted is not None:
+        low, high = beyond_range(item.fitted)
+        yield from _beyond(item, "outside", (value < low) | (value > high), value, t, item.fitted)
+
+
+def _beyond(
     item: State | Input,
     cause: str,
-    limits: tuple[float, float] | None,
-    highest: np.ndarray,
-    lowest: np.ndarray,
+    rows: np.ndarray,
+    value: np.ndarray,
     t: np.ndarray,
+    limits: tuple[float, float] = (-np.inf, np.inf),
 ) -> Iterator[FoundEpisode]:
-    if limits is None:
-        return
+    """Yield the times in which a condition of an item holds, rows (n,), with its most extreme value there."""
     low, high = limits
-    for run in runs((highest < low) | (lowest > high), JOINED):
-        own = 0.5 * (highest + lowest)[run.begin : run.end]
+    for run in runs(rows, JOINED):
+        own = value[run.begin : run.end]
         smallest, largest = float(np.nanmin(own)), float(np.nanmax(own))
-        size = largest if largest > high else smallest
         facts = TwinFacts(
             name=item.name,
             cause=cause,
             start=run.start(t),
-            size=size,
+            size=largest if largest > high else smallest,
             unit=item.unit,
             limits=f"{low:g} to {high:g}",
         )
-        found = _found(cause, facts, run.over(t), smallest, largest, run, t)
-        yield (
-            found._replace(episode=found.episode._replace(grade="advisory"))
-            if cause == "outside" and item.widens
-            else found
-        )
+        yield _found(cause, facts, run.over(t), smallest, largest, run, t)
 
 
 def impoverished_particles(judged: JudgedRows) -> Iterator[FoundEpisode]:

@@ -10,7 +10,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from estimators.diagnostics.detector_state import no_baseline
-from estimators.diagnostics.detectors import ADVISORY_ALARM, ALARM_NAMES, IMPOSSIBLE, OUTSIDE, OUTSIDE_WIDENED
+from estimators.diagnostics.detectors import ADVISORY_ALARM, ALARM_NAMES, FAR_OUTSIDE, IMPOSSIBLE, OUTSIDE, memory_flag
 from estimators.diagnostics.health import HealthPolicy
 from estimators.fold import Fold, fold
 from estimators.log import INPUT, READING, RESET, TICK, TRUTH, Events, Log
@@ -58,7 +58,7 @@ MODEL = StateSpaceModel(
         State("a", "m", mean=0.0, std=1.0, fitted=(-3.0, 3.0), limits=(-3.5, 3.5)),
         State("b", "m", mean=0.0, std=1.0),
     ),
-    inputs=(Input("feed", "m/s", fitted=(-1.0, 1.0), widens=True),),
+    inputs=(Input("feed", "m/s", fitted=(-1.0, 1.0)),),
     noises=(Noise("a", "m²/s", 0.04), Noise("b", "m²/s", 0.04)),
     sensors=(
         Sensor("one", (Row("one", "m", 0.25),), h=first_state, limits=Limits(range=((-9.0, 9.0),))),
@@ -74,6 +74,7 @@ POLICY = HealthPolicy(
     window=20, degraded_after=3.0, stale_after=12.0, diverged_nis=30.0, diverged_gated=0.9, false_alarm_every=600.0
 )
 """Of the window little is asked, so that what the tests say is seen."""
+CORRECTED = memory_flag(0) | memory_flag(1)  # See test_memory.py
 
 
 # The oracle
@@ -161,10 +162,14 @@ class RowOracle:
         self.followers = {FIRST_GAIN + k: Follower(gain) for k, gain in enumerate(GAINS)}
         self.refusals, self.repetition = Cusum("refused"), Cusum("stuck")
         self.raw = self.before = None
-        self.calm = 0
+        self.calm, self.outside, self.share = 0, 0, 0.0
         self.said = set()
 
-    def innovation(self, e, h):
+    def innovation(self, e, h, sensor):
+        # The share outside the bands in 600 s, and at least 100 measurements.
+        period = (sensor.times[-1] - sensor.times[0]) / len(sensor.times)
+        self.outside = min(self.outside + 1, max(100, 600.0 / max(period, 1e-6)))
+        self.share += ((abs(e) > 1.959963984540054) - self.share) / self.outside
         bias, scale, phi = self.base[:3]
         raw = min(max((e - bias) / scale, -6.0), 6.0)
         white = raw
@@ -231,6 +236,9 @@ class RowOracle:
         mean, square, _ = self.recent
         if gated and "spiky" in rest:
             rest -= {"spiky", "narrow"} if square < 0.3 else {"spiky"}
+        n, out = self.outside, self.share
+        if n < 100 or out - 1.645 * math.sqrt(out * (1.0 - out) / n) <= 0.1:
+            rest -= {"narrow", "spiky", "alternating"}
         share = 1.0 - r / self.std**2 if self.std else 0.0
         if mean**2 <= share:
             lagging = {"correlated", "alternating"}
@@ -337,7 +345,7 @@ def by_definition(events, track, gate, baseline, expected):
                         said = (said - {"refused"}) | row.refusals.put(ratio, sensor.h, row.base[-2], row.said)
                     if judged and not screened and not begins:
                         e = nu / std
-                        said = (said & {"refused", "stuck"}) | row.innovation(e, sensor.h)
+                        said = (said & {"refused", "stuck"}) | row.innovation(e, sensor.h, sensor)
                     if k == 0:
                         said = said - {"disagreeing", "agreeing"} | (together if judged else sensor.said)
                     row.said, row.grade = said, row.graded(said, gate is not None, R[index])
@@ -352,11 +360,10 @@ def by_definition(events, track, gate, baseline, expected):
         for sensor in sensors:
             sensor.silent |= now > sensor.due
         silent = sum(1 << s for s, sensor in enumerate(sensors) if sensor.silent)
-        flags = silent
-        if not -3.0 <= track.mean[i, 0] <= 3.0:
-            flags |= OUTSIDE
-        elif not -1.0 <= feed <= 1.0:
-            flags |= OUTSIDE_WIDENED
+        flags = silent | int(track.flags[i]) & CORRECTED
+        # Of a range of ±1 5 % more counts, and half of its width is far.
+        beyond = max(abs(track.mean[i, 0]) / 3.0, abs(feed))
+        flags |= (OUTSIDE if beyond > 1.1 else 0) | (FAR_OUTSIDE if beyond > 2.0 else 0)
         if abs(track.mean[i, 0]) - 1.959963984540054 * track.std[i, 0] > 3.5:
             flags |= IMPOSSIBLE
         said = set().union(*(row.said for row in rows))
@@ -370,9 +377,7 @@ def by_definition(events, track, gate, baseline, expected):
             health = DEGRADED
         else:
             grades = {row.grade for row in rows}
-            health = SUSPECT if "suspect" in grades or flags & ~OUTSIDE_WIDENED else TRACKING
-            if health == TRACKING and ("advisory" in grades or flags):
-                health = ADVISORY
+            health = SUSPECT if "suspect" in grades or flags else ADVISORY if "advisory" in grades else TRACKING
         yield alarms, flags, health
 
 
@@ -478,7 +483,7 @@ def test_all_that_can_be_said_is_said_in_those_streams():
         healths |= set(track.health)
         verdicts |= set(track.verdict)
     assert bits == (1 << len(ALARM_NAMES)) - 1 | ADVISORY_ALARM
-    assert flags == OUTSIDE | OUTSIDE_WIDENED | IMPOSSIBLE | 0b111
+    assert flags & ~CORRECTED == OUTSIDE | FAR_OUTSIDE | IMPOSSIBLE | 0b111
     assert healths == {WAITING, TRACKING, ADVISORY, SUSPECT, DEGRADED, DIVERGED, STALE}
     assert verdicts >= {USED, GATED, HELD_OUT, MISSING, SCREENED}
 
@@ -554,7 +559,10 @@ def walk(wrong, *, gate=None, silent=(0.0, 0.0)):
     ("case", "states"),
     [
         ({"wrong": lambda t: 0.0}, [WAITING, TRACKING]),
-        ({"wrong": lambda t: 2.0 * (-1) ** round(4 * t) * (40 < t < 60)}, [WAITING, TRACKING, SUSPECT, TRACKING]),
+        (
+            {"wrong": lambda t: 2.0 * (-1) ** round(4 * t) * (40 < t < 60)},
+            [WAITING, TRACKING, ADVISORY, SUSPECT, TRACKING],
+        ),
         (
             {"wrong": lambda t: 4.0 * (40 < t < 43), "gate": 0.9999},
             [WAITING, TRACKING, DEGRADED, SUSPECT, ADVISORY, TRACKING],

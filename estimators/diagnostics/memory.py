@@ -1,0 +1,264 @@
+"""Are the corrections of a state larger than they should be over its own memory?
+
+An error of the model that lasts is taken up by small corrections of one sign, each inside its band, which the tests of
+single innovations cannot tell from chance (`detectors.py`); the estimate stays wrong by what the next corrections will
+add. Under the model each correction x⁺ - x⁻ of an optimal filter has covariance P⁻ - P⁺ and is uncorrelated with those
+before. Carried to the end of a time by the tangent F of the model,
+
+    d ← F d + (x⁺ - x⁻),   D ← F D Fᵀ + (P⁻ - P⁺),   Φ ← F Φ,
+
+d is, to first order, the estimate less the forecast without the measurements of that time, and D its covariance: for a
+state j, z = d_j / √D_jj is N(0, 1), and ρ = P_jj / (P_jj + D_jj) is the share of the forecast's variance that the
+measurements left. Where ρ is between `LOW` and `HIGH`, the time is the memory of the state. Two times that follow each
+other are one: (Φ₂ Φ₁, Φ₂ d₁ + d₂, Φ₂ D₁ Φ₂ᵀ + D₂). So the times of level k are pairs of those of level k - 1, and the
+test of a level, a CUSUM of z² as of another variance, runs over pairs that overlap by half. It needs neither a grid of
+times nor a horizon to choose, and a measurement costs the same however long the memory is.
+
+Sources: Bar-Shalom, Li & Kirubarajan (2001), 5.2.6 (innovations are white; K S Kᵀ = P⁻ - P⁺); Basseville & Nikiforov
+(1993), chapter 2 (CUSUM).
+"""
+
+from __future__ import annotations
+
+import numpy as np
+
+from ..compiled.context import circular_states, estimated, shown_states
+from ..compiled.jacobians import scratch_size, state_jacobian
+from ..estimator import Estimator
+from ..model.state_space import StateSpaceModel
+from ..numerics.jit import inlined, part, plain
+from ..numerics.linalg import congruence, wrap
+from ..numerics.workspace import declare_layout, size_of, view
+from .detectors import MEMORY_AT, MEMORY_FLAGS, memory_flag
+
+FIRST, LEVELS = 16, 16  # Measurements of a time of the first level, and the levels: half a million measurements
+MOST = 32  # States of a model whose memory is followed
+LOW, HIGH = 0.2, 0.9  # ρ of the times that are a state's memory
+VARIANCE = 2.5  # Of z, that the tests look for
+MAX_Z = 6.0  # |z| is clipped here: a single correction is no proof
+BEYOND = np.log(100.0)  # log Λ from which a state is in alarm, until it is half of that; twice that is its highest
+
+COVARIANCE, FACTOR = 1, 2  # What follows the mean in the state of a filter
+
+Time, time_of = declare_layout("Time", "n", Phi="n, n", D="n, n", d="n")
+Level, level_of = declare_layout("Level", "n", time_of, last="Time(at, n)", W="n", rho="n", kept="2")
+Memory, memory_of = declare_layout(
+    "Memory",
+    "n",
+    time_of,
+    scratch_size,
+    count="2",  # measurements of the present time; bits of the states in alarm
+    now="Time(at, n)",
+    joined="Time(at, n)",
+    x="n",
+    P="n, n",
+    F="n, n",
+    products="2 * n, n",
+    jacobian="scratch_size(n, n)",
+)
+
+
+@inlined
+def level_words(n):
+    """Return the float64s of a level."""
+    return 2 * n * n + 3 * n + 2
+
+
+def memory_context(estimator: Estimator, model: StateSpaceModel) -> dict[str, int]:
+    """Return the memory's entries of a filter's context.
+
+    `memory` is how the filter's state keeps its spread, `COVARIANCE` or `FACTOR`, or 0 if no memory is followed; bits
+    of shown states are set in `graded` if their memory is judged, and in `unwatched` if it leaves the twin's health.
+    """
+    followed = model.nx <= MOST and not model.black_box and estimator.family == "Gaussian"
+    kind = FACTOR if estimator.name.startswith("sr-") else COVARIANCE
+    shown = model.shown_states[:MEMORY_FLAGS]
+    return {
+        "memory": kind if followed else 0,
+        "graded": sum(1 << k for k, state in enumerate(shown) if not state.appended),
+        "unwatched": sum(memory_flag(k) for k, state in enumerate(shown) if not state.watched),
+    }
+
+
+def fresh_memory(model: StateSpaceModel) -> np.ndarray:
+    """Return the memory before the first event."""
+    n = model.nx
+    memory = np.zeros(size_of(memory_of, n) + LEVELS * size_of(level_of, n))
+    np.fill_diagonal(view(plain(memory_of)(0, n).now.Phi, memory), 1.0)
+    return memory
+
+
+@inlined
+def _clear(time):
+    """No correction, in no time."""
+    time.d[:] = 0.0
+    time.D[:] = 0.0
+    time.Phi[:] = 0.0
+    for i in range(time.d.size):
+        time.Phi[i, i] = 1.0
+
+
+@inlined
+def _copy(time, other):
+    other.d[:] = time.d
+    other.D[:] = time.D
+    other.Phi[:] = time.Phi
+
+
+@part
+def _carry(F, rows, time, products):
+    """Φ ← F Φ, d ← F d, D ← F D Fᵀ, where F is the identity beyond its first `rows`."""
+    n = F.shape[0]
+    congruence(F, rows, time.D, products)
+    moved = products[n]
+    for i in range(rows):
+        moved[i] = 0.0
+        for j in range(n):
+            products[i, j] = 0.0
+        for k in range(n):
+            a = F[i, k]
+            if a != 0.0:
+                moved[i] += a * time.d[k]
+                for j in range(n):
+                    products[i, j] += a * time.Phi[k, j]
+    time.d[:rows] = moved[:rows]
+    time.Phi[:rows] = products[:rows]
+
+
+@part
+def forget_memory(at, n):
+    """Begin again: after a reset, or where a number is not finite."""
+    own = memory_of(at, n)
+    own.count[0] = own.count[1] = 0.0
+    _clear(own.now)
+    for k in range(LEVELS):
+        level = level_of(own.end + 8 * k * level_words(n), n)
+        level.kept[:] = 0.0
+        level.W[:] = 0.0
+        level.rho[:] = 0.0
+
+
+@part
+def carry_memory(context, at, x, u, dt):
+    """Note a prediction of dt seconds from x."""
+    own = memory_of(at, context.nx)
+    state_jacobian(context, x, u, dt, own.F, own.jacobian)
+    _carry(own.F, estimated(context), own.now, own.products)
+
+
+@inlined
+def _spread(kind, n, state, P):
+    """P (n, n) ← the covariance in the state of a filter."""
+    for i in range(n):
+        for j in range(i + 1):
+            if kind == FACTOR:
+                s = 0.0
+                for k in range(n):
+                    s += state[n + k * n + i] * state[n + k * n + j]
+                P[i, j] = P[j, i] = s
+            else:
+                P[i, j] = P[j, i] = state[n + i * n + j]
+
+
+@part
+def before_update(context, at, state):
+    """Keep the prediction."""
+    own = memory_of(at, context.nx)
+    own.x[:] = state[: context.nx]
+    _spread(context.memory, context.nx, state, own.P)
+
+
+@part
+def after_update(context, at, state):
+    """Add a correction, and judge the times that end with it."""
+    n = context.nx
+    own, circular = memory_of(at, n), circular_states(context)
+    now = own.now
+    for i in range(n):
+        moved = state[i] - own.x[i]
+        now.d[i] += wrap(moved) if circular[i] != 0 else moved
+        for j in range(n):
+            now.D[i, j] += own.P[i, j]
+    _spread(context.memory, n, state, own.P)
+    for i in range(n):
+        for j in range(n):
+            now.D[i, j] -= own.P[i, j]
+    own.count[0] += 1.0
+    if own.count[0] >= FIRST:
+        _end_time(context, at, own)
+
+
+@inlined
+def memory_flags(at, n):
+    """Return the bits of `Track.flags` of the states in alarm."""
+    return int(memory_of(at, n).count[1]) << MEMORY_AT
+
+
+@part
+def _end_time(context, at, own):
+    """End a time of the first level, and of each level that it completes."""
+    n = context.nx
+    own.count[0] = 0.0
+    for k in range(LEVELS):
+        level = level_of(own.end + 8 * k * level_words(n), n)
+        completes = level.kept[1] != 0.0
+        if level.kept[0] != 0.0:
+            _copy(level.last, own.joined)
+            _carry(own.now.Phi, estimated(context), own.joined, own.products)
+            for i in range(n):
+                own.joined.d[i] += own.now.d[i]
+                for j in range(n):
+                    own.joined.D[i, j] += own.now.D[i, j]
+            if not _weigh(own.joined, own.P, estimated(context), level):
+                forget_memory(at, n)
+                return
+        _copy(own.now, level.last)
+        level.kept[0] = 1.0
+        level.kept[1] = 0.0 if completes else 1.0
+        if not completes:
+            break
+        _copy(own.joined, own.now)
+    _clear(own.now)
+    own.count[1] = float(_in_alarm(context, own, int(own.count[1])))
+
+
+@inlined
+def _weigh(time, P, estimated, level):
+    """Add log Λ of a time to the tests of its level; False if a number is not finite.
+
+    A considered parameter δ stays in the error, Cov(d, δ) = D_δ, so corrections that it causes follow each other: to
+    the variance of d comes -2 D_δ P_δ / P_δδ, which is exact for times longer than the memory, and bounds shorter ones.
+    """
+    for j in range(level.W.size):
+        D = time.D[j, j]
+        rho = P[j, j] / (P[j, j] + D)
+        if not (np.isfinite(rho) and np.isfinite(time.d[j])):
+            return False
+        level.rho[j] = rho
+        if rho < 1.0 - 1e-9:
+            shared = 0.0
+            for k in range(estimated, level.W.size):
+                shared += time.D[j, k] * P[k, j] / P[k, k]
+            z = min(abs(time.d[j]) / np.sqrt(D + 2.0 * max(0.0, -shared)), MAX_Z)
+            # Half of each time is in the one before, too.
+            gained = 0.25 * (1.0 - 1.0 / VARIANCE) * z * z - 0.25 * np.log(VARIANCE)
+            level.W[j] = min(max(level.W[j] + gained, 0.0), 2.0 * BEYOND)
+    return True
+
+
+@inlined
+def _in_alarm(context, own, before):
+    """Return the bits of the shown states whose corrections are too large over their memory."""
+    n, bits = context.nx, 0
+    shown = shown_states(context)
+    for s in range(min(shown.size, MEMORY_FLAGS)):
+        if context.graded >> s & 1 == 0:
+            continue
+        j, most = shown[s], 0.0
+        for k in range(LEVELS):
+            level = level_of(own.end + 8 * k * level_words(n), n)
+            if level.kept[0] != 0.0 and level.rho[j] > LOW and level.rho[j] < HIGH:
+                most = max(most, level.W[j])
+        if most >= (0.5 * BEYOND if before >> s & 1 else BEYOND):
+            bits |= 1 << s
+    return bits

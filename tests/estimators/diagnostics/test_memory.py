@@ -1,0 +1,122 @@
+"""Corrections over a state's own memory are those since a forecast, and tell of a steady error."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from estimators.diagnostics.detectors import memory_flag
+from estimators.diagnostics.health import HealthPolicy
+from estimators.diagnostics.memory import fresh_memory, level_of, memory_of
+from estimators.diagnostics.references import HALF_WIDTH, own_grades, state_health
+from estimators.log import INPUT, READING, RESET
+from estimators.model.state_space import Input, Noise, Row, Sensor, State, StateSpaceModel
+from estimators.numerics.jit import plain
+from estimators.numerics.workspace import size_of, view
+from estimators.track import SUSPECT
+from tests.support import folded, log_of
+
+
+def f(x, u, p, dt, out):
+    out[0] = x[0] + dt * 1e-3 * u[0]
+    out[1] = x[1] + dt * (u[0] - x[1]) / 20.0
+
+
+def h(x, u, p, out):
+    out[0] = x[0] + 0.05 * x[1]
+
+
+CELL = StateSpaceModel(
+    name="cell",
+    title="charge and polarisation",
+    states=(State("charge", "1", 0.5, 0.05), State("polarisation", "V", 0.0, 0.1)),
+    inputs=(Input("current", "A"),),
+    noises=(Noise("charge", "1/s", 1e-8), Noise("polarisation", "V²/s", 1e-4)),
+    sensors=(Sensor("voltage", (Row("voltage", "V", 4e-4),), h=h),),
+    f=f,
+    linear=True,
+)
+QUIET = HealthPolicy(false_alarm_every=1e12)
+VOLTAGE = CELL.sensors[0].rows[0].variance
+
+
+def cell(scale, n, seed=0):
+    """A log of a cell whose current is known with a wrong scale, and its true states (n, 2)."""
+    rng = np.random.default_rng(seed)
+    current = 0.3 * np.repeat(rng.standard_normal(n // 50 + 1), 50)[:n]
+    x, states, rows = rng.normal([0.5, 0.0], [0.05, 0.1]), [], []
+    for i in range(n):
+        if i:
+            f(x.copy(), current[i - 1 : i], (), 1.0, x)
+            x += rng.normal(0.0, [1e-4, 1e-2])
+        states.append(x.copy())
+        rows += [(i, INPUT, scale * current[i]), (i, READING, x[0] + 0.05 * x[1] + rng.normal(0.0, VOLTAGE**0.5))]
+    return log_of(CELL.width, *rows), np.array(states)
+
+
+def by_forecasts(log, first, end):
+    """z and rho of both states, from a forecast without the measurements `first` to `end` of a dense Kalman filter."""
+    F, Q, H = np.diag([1.0, 0.95]), np.diag([1e-8, 1e-4]), np.array([1.0, 0.05])
+    u, y = log.value[0 : log.n : 2, 0], log.value[1 : log.n : 2, 0]
+    x, P, start = np.array([0.5, 0.0]), np.diag([0.05**2, 0.1**2]), None
+    for k in range(end):
+        for own in (x, start[0]) if start else (x,):
+            if k:
+                own[:] = F @ own + np.array([1e-3, 0.05]) * u[k - 1]
+        if k:
+            P = F @ P @ F.T + Q
+            start = start and (start[0], F @ start[1] @ F.T + Q)
+        if k == first:
+            start = x.copy(), P
+        K = P @ H / (H @ P @ H + VOLTAGE)
+        x, P = x + K * (y[k] - H @ x), P - np.outer(K, H @ P)
+    spread = np.diag(start[1] - P)
+    return (x - start[0]) / np.sqrt(spread), np.diag(P) / np.diag(start[1])
+
+
+@pytest.mark.parametrize("name", ["kf", "ekf", "ukf", "sr-kf", "sr-ukf"])
+def test_corrections_are_those_since_a_forecast(name):
+    log, _ = cell(1.3, 64)
+    memory = folded(name, CELL, log).evidence[-1 - fresh_memory(CELL).size :]
+    first = size_of(memory_of, 2)
+    for k, times in enumerate((((0, 32), (16, 48), (32, 64)), ((0, 64),))):
+        W = np.zeros(2)
+        for time in times:
+            z, rho = by_forecasts(log, *time)
+            # Half of log Λ of the variance 2.5 against 1, as the times overlap by half.
+            W = np.maximum(W + 0.15 * np.clip(z, -6.0, 6.0) ** 2 - 0.25 * np.log(2.5), 0.0)
+        level, own = plain(level_of)(0, 2), memory[first + k * size_of(level_of, 2) :]
+        np.testing.assert_allclose((view(level.W, own), view(level.rho, own)), (W, rho), rtol=1e-6, err_msg=f"{time}")
+
+
+def told(scale, model=CELL, seed=0):
+    """Whether the charge is in its band, whether its state and the twin are suspect, by measurement; the fold."""
+    log, true = cell(scale, 4000, seed)
+    fold = folded("kf", model, log, policy=QUIET)
+    track = fold.track.select(slice(1, None, 2))
+    held = np.abs(track.mean[:, 0] - true[:, 0]) <= HALF_WIDTH * track.std[:, 0]
+    return held, state_health(track, 0) == SUSPECT, track.health == SUSPECT, fold
+
+
+@pytest.mark.parametrize("seed", range(4))
+def test_a_model_that_is_right_is_never_suspect(seed):
+    held, own, twin, _ = told(1.0, seed=seed)
+    assert held.mean() > 0.85 and not own.any() and not twin.any()
+
+
+def test_a_steady_error_that_no_sensor_shows_is_told_of_the_state_that_it_moves():
+    held, own, twin, fold = told(0.9)
+    assert not fold.track.alarms.any(), "single innovations show nothing"
+    assert (~held & ~own).mean() <= 0.05 and own.mean() > 0.5
+    assert not (fold.track.flags & memory_flag(1)).any() and np.array_equal(own, twin)
+    found = own_grades(CELL, fold.track, fold.u)
+    assert found == {"charge": ("suspect", "corrected over its memory by more than its band allows")}
+    *_, unwatched, _ = told(0.9, replace(CELL, states=(replace(CELL.states[0], watched=False), CELL.states[1])))
+    assert not unwatched.any()
+
+
+def test_a_reset_begins_again():
+    log, _ = cell(0.9, 4000)
+    log.extend(log_of(CELL.width, (4000, RESET, 0.0)).events)
+    flags = folded("kf", CELL, log).track.flags
+    assert flags[-2] & memory_flag(0) and not flags[-1]
