@@ -38,7 +38,7 @@ from ..estimator import TANGENT, Estimator, Option, Options, SmoothingRule
 from ..model.state_space import LARGE, StateSpaceModel
 from ..numerics.jit import ints, jit
 from ..numerics.linalg import wrap
-from ..numerics.random import key_of, normal, unit, word
+from ..numerics.random import fill_normals, key_of, normal, unit, word
 from ..numerics.simd import add_scaled
 from ..numerics.workspace import declare_layout, share, size_of, start_of, view
 from ..tuning import Tuning
@@ -168,8 +168,7 @@ def start(context, mean, cov, state):
     X, draws, ranks, _ = parts(context, state)
     N, n = X.shape
     draws[0] = 0.0
-    for k in range(BINS):
-        ranks[k] = 0.0
+    ranks[:] = 0.0
     key = key_of(context.seed, 0, START)
     z = np.empty(n)
     total = np.zeros(n)
@@ -178,10 +177,9 @@ def start(context, mean, cov, state):
     L = np.empty((side, side))
     if not diagonal:
         belief_root(cov, L)
+    X[:] = 0.0
     for i in range(N):
-        for j in range(n):
-            z[j] = normal(key, np.uint64(i * n + j))
-            X[i, j] = 0.0
+        fill_normals(key, np.uint64(i * n), n, z)
         if diagonal:
             if context.shape != 0:
                 shaped(context, z, X[i])
@@ -259,12 +257,10 @@ def forecast(context, u, dt, key, X, crew, crews, scratch):
             # Noise that depends on the state does so where the step began.
             if context.Q_varies != 0:
                 noise_root(context, x, u, dt, L, spare)
-            for j in range(n):
-                z[j] = normal(key, np.uint64(base + j))
+            fill_normals(key, np.uint64(base), n, z)
             add_noise(L, z, forward)
         elif context.shape != 0:
-            for j in range(n):
-                z[j] = normal(key, np.uint64(base + j))
+            fill_normals(key, np.uint64(base), n, z)
             shaped(context, z, w)
             add_scaled(n, np.sqrt(q[0] * dt), w, forward)
         else:
@@ -315,8 +311,7 @@ def add_spread(context, index, X, scratch):
     room = forecast_at(start_of(scratch), n, 0)
     z, w = room.z, room.w
     for i in range(N // 2):
-        for j in range(n):
-            z[j] = normal(key, np.uint64(i * n + j))
+        fill_normals(key, np.uint64(i * n), n, z)
         drawn = z
         if context.shape != 0:
             shaped(context, z, w)

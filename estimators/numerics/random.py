@@ -26,7 +26,7 @@ GAMMA = np.uint64(0x9E3779B97F4A7C15)
 """The golden ratio in 64 bits, odd: SplitMix64's step."""
 
 _M1, _M2 = np.uint64(0xBF58476D1CE4E5B9), np.uint64(0x94D049BB133111EB)
-_S30, _S27, _S31, _S9, _S12 = (np.uint64(s) for s in (30, 27, 31, 9, 12))
+_S30, _S27, _S31, _S12 = (np.uint64(s) for s in (30, 27, 31, 12))
 _LAYER = np.uint64(0xFF)
 _OTHER = np.uint64(0xD1B54A32D192ED03)
 _TO_UNIT = 2.0**-52
@@ -125,24 +125,3 @@ def fill_normals(key, first, n, out):
     """Fill out (n or more,) with the normals `first` and following of a key."""
     for i in range(n):
         out[i] = normal(key, first + np.uint64(i))
-
-
-@jit
-def normals(seed, index, stream, first_member, out):
-    """Fill `out` (members, k) with N(0, 1): rows `first_member` and following of the block of (seed, index, stream).
-
-    Any split of a block of the same k gives the same numbers.
-    """
-    key = key_of(seed, index, stream)
-    k = out.shape[1]
-    i = np.uint64(first_member) * np.uint64(k)
-    for member in range(out.shape[0]):
-        for j in range(k):
-            out[member, j] = normal(key, i)
-            i += ONE
-
-
-@jit
-def uniform(seed, index, stream):
-    """One number in (0, 1)."""
-    return unit(word(key_of(seed, index, stream), np.uint64(0)))

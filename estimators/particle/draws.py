@@ -9,7 +9,7 @@ import numpy as np
 from ..compiled.context import circular_states, estimated, jump_chances
 from ..compiled.noise import add_noise, belief_root, lost_root
 from ..numerics.jit import floats, jit, matrix
-from ..numerics.random import GAMMA, key_of, mix, normal, unit, word
+from ..numerics.random import GAMMA, fill_normals, key_of, mix, unit, word
 from .cloud import (
     CONSIDER,
     HEAD,
@@ -89,8 +89,7 @@ def any_mode(context, key, member):
 def reset(context, mean, state):
     """Clear the head of a state, and fill the mask of circular states."""
     circular = circular_states(context)
-    for i in range(HEAD):
-        state[i] = 0.0
+    state[:HEAD] = 0.0
     cloud = own_cloud(context, state)
     for j in range(mean.size):
         cloud.circular[j] = circular[j]
@@ -107,11 +106,10 @@ def scatter(context, mean, root, key, records):
     for k in range(mode + 1):
         variance += root[mode, k] * root[mode, k]
     for i in range(records.shape[0]):
+        fill_normals(key, np.uint64(i * nx), nx, z)
         for j in range(nx):
-            z[j] = normal(key, np.uint64(i * nx + j))
             records[i, j] = mean[j]
-        for j in range(nx, records.shape[1]):
-            records[i, j] = 0.0
+        records[i, nx:] = 0.0
         add_noise(root, z, records[i, :nx])
         if mode >= 0:
             records[i, mode] = nearest_mode(context, records[i, mode], mean[mode], np.sqrt(variance))
@@ -145,8 +143,7 @@ def spread_by(context, root, key, first, records):
     circular = circular_states(context)
     z = np.empty(nx)
     for i in range(records.shape[0]):
-        for j in range(nx):
-            z[j] = normal(key, np.uint64((first + i) * nx + j))
+        fill_normals(key, np.uint64((first + i) * nx), nx, z)
         if mode >= 0:
             kept = records[i, mode]
         add_noise(root, z, records[i, :nx])
@@ -180,8 +177,7 @@ def reconsider(context, index, state):
     key = key_of(context.seed, index, CONSIDER)
     z = np.empty(count)
     for member in range(cloud.records.shape[0]):
-        for k in range(count):
-            z[k] = normal(key, np.uint64(member * count + k))
+        fill_normals(key, np.uint64(member * count), count, z)
         for i in range(count):
             moved = mean[first + i] - cloud.mean[first + i]
             for k in range(count):
