@@ -9,7 +9,7 @@ from ..compiled.jacobians import scratch_size, sensor_jacobian, state_jacobian
 from ..estimator import TANGENT, Estimator, Options, SmoothingRule
 from ..model.state_space import StateSpaceModel
 from ..numerics.jit import by_address, embedded, inlined, part
-from ..numerics.linalg import congruence, mirror, solve_transposed
+from ..numerics.linalg import congruence, mirror, multiply_transposed, solve_transposed
 from ..numerics.simd import dot
 from ..numerics.simd_ir import LANES
 from ..numerics.simd_rows import multiply_rows
@@ -103,9 +103,8 @@ def predict(context, u, dt, index, state, work):
 @inlined
 def sparse_product(P, H, C):
     """C = P Hᵀ, where most of H is zero, as a sensor sees few of the states and the considered ones."""
+    C[:] = 0.0
     for k in range(H.shape[0]):
-        for i in range(C.shape[0]):
-            C[i, k] = 0.0
         for j in range(H.shape[1]):
             a = H[k, j]
             if a != 0.0:
@@ -131,12 +130,7 @@ def project(P, H, estimated, C, S, W):
     if estimated < n:
         sparse_product(P, H, C)
     else:
-        for i in range(n):
-            for k in range(m):
-                s = 0.0
-                for j in range(n):
-                    s += P[i, j] * H[k, j]
-                C[i, k] = s
+        multiply_transposed(P, H, C)
     for k in range(m):
         for i in range(m):
             s = 0.0

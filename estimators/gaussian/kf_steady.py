@@ -24,8 +24,9 @@ from ..errors import EstimatorError
 from ..estimator import Estimator, Option, Options
 from ..model.parts import covariance_of
 from ..model.state_space import StateSpaceModel
-from ..numerics.jit import by_address, inlined, part
-from ..numerics.linalg import congruence, unit_factor
+from ..model.wrapping import noise_function
+from ..numerics.jit import by_address, inlined, part, plain
+from ..numerics.linalg import congruence, copy, unit_factor
 from ..numerics.workspace import declare_layout, start_of
 from ..track import USED
 from ..tuning import Tuning
@@ -76,15 +77,6 @@ def start(context, mean, cov, state):
     """Set the state to N(mean, cov)."""
     shared.start(context, mean, cov, state)
     phase_of(state)[0] = MOVING
-
-
-@part
-def copy(A, P):
-    """P ← A."""
-    n = P.shape[0]
-    for i in range(n):
-        for j in range(n):
-            P[i, j] = A[i, j]
 
 
 @part
@@ -218,16 +210,11 @@ def matrices(
     n, m = model.nx, len(model.sensors[0].rows)
     steps = steps_of(period, float(model.max_step))
     dt = period / steps
-    f, h = _plain(model.f), _plain(model.sensors[0].h)
+    f, h = plain(model.f), plain(model.sensors[0].h)
     F = columns(lambda x, out: f(x, u, p, dt, out), n, n)
     H = columns(lambda x, out: h(x, u, p, out), n, m)
     Q = np.zeros((n, n))
-    if model.Q is None:
-        for noise, variance in zip(model.noises, q, strict=True):
-            j = model.state_names.index(noise.name)
-            Q[j, j] += variance * dt
-    else:
-        _plain(model.Q)(model.prior_mean.copy(), u, p, q, dt, Q)
+    plain(noise_function(model))(model.prior_mean.copy(), u, p, q, dt, Q)
     F *= np.exp(0.5 * rate * dt)
     total_F, total_Q = np.eye(n), np.zeros((n, n))
     for _ in range(steps):
@@ -295,10 +282,6 @@ def applies(model: StateSpaceModel) -> str | None:
         if not all(np.allclose(a, b, rtol=1e-9, atol=1e-12) for a, b in zip(here, there, strict=True)):
             return f"{model.name} varies with its inputs: no one steady state; use kf"
     return undetectable(model, here[0], here[2])
-
-
-def _plain(function: Callable) -> Callable:
-    return getattr(function, "py_func", function)
 
 
 KF_STEADY = Estimator(

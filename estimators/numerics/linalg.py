@@ -277,6 +277,25 @@ def bordered_congruence(F, rows, P, T):
 
 
 @inlined
+def copy(A, B):
+    """B ← A, of which B may have more columns."""
+    for i in range(A.shape[0]):
+        for j in range(A.shape[1]):
+            B[i, j] = A[i, j]
+
+
+@inlined
+def multiply_transposed(A, B, out):
+    """Fill out = A Bᵀ."""
+    for i in range(A.shape[0]):
+        for k in range(B.shape[0]):
+            s = 0.0
+            for j in range(A.shape[1]):
+                s += A[i, j] * B[k, j]
+            out[i, k] = s
+
+
+@inlined
 def mirror(P):
     """Copy the lower triangle of P onto the upper."""
     for i in range(P.shape[0]):

@@ -23,6 +23,7 @@ from ..estimator import Estimator, Option, Options
 from ..gaussian.shared import admit
 from ..model.state_space import StateSpaceModel
 from ..numerics.jit import floats, jit, matrix
+from ..numerics.linalg import copy
 from ..numerics.peaks import peaks_of
 from ..numerics.random import key_of, normal
 from ..track import FAILED, MISSING, USED
@@ -92,8 +93,7 @@ def _begin(context, mean, cov, index, stream, state):
         x = records[i, :nx]
         for a in range(nx):
             x[a] = mean[a]
-            for b in range(nx):
-                C[a, b] = cov[a, b]
+        copy(cov, C)
         if context.mode >= 0:
             j = context.mode
             std = np.sqrt(cov[j, j])
@@ -128,9 +128,7 @@ def _recover(context, index, state):
     C, column, before = np.empty((nx, nx)), np.empty(nx), np.empty(nx)
     mode = 0.0
     for i in range(records.shape[0]):
-        for a in range(nx):
-            for b in range(nx):
-                C[a, b] = cov[a, b]
+        copy(cov, C)
         if context.mode >= 0:
             drop(C, context.mode)
             mode = any_mode(context, jump_key(key), i)

@@ -28,7 +28,7 @@ from ..estimator import Options
 from ..gaussian.shared import factor
 from ..model.state_space import StateSpaceModel
 from ..numerics.jit import jit, threaded
-from ..numerics.linalg import solve_transposed, wrap
+from ..numerics.linalg import copy, solve_transposed, wrap
 from ..numerics.normal_score import add_tail
 from ..numerics.random import ONE, normal
 from ..numerics.workspace import declare_layout
@@ -127,9 +127,8 @@ def _given(C, j, step, x, column):
 @jit
 def drop(C, j):
     """Remove the uncertainty of state j."""
-    for i in range(C.shape[0]):
-        C[i, j] = 0.0
-        C[j, i] = 0.0
+    C[:, j] = 0.0
+    C[j] = 0.0
 
 
 @jit
@@ -188,14 +187,10 @@ def predict_block(context, u, dt, sensor, y, key, value, state, work, number):
         if jumps:
             jump(context, x, u, dt, jumping, i, chances)
         if varies or i == first:
-            for a in range(nx):
-                for b in range(nx):
-                    Q[a, b] = 0.0
+            Q[:] = 0.0
             add_process_noise(context, x, u, dt, Q, T)
         transition(context, x, u, dt, forward)
-        for a in range(nx):
-            for b in range(nx):
-                C[a, b] = Q[a, b]
+        copy(Q, C)
         if linear.size > 0:
             state_jacobian(context, x, u, dt, F, room.scratch)
             for a in range(nx):
@@ -220,15 +215,12 @@ def predict_block(context, u, dt, sensor, y, key, value, state, work, number):
             finite &= np.isfinite(forward[j]) and np.isfinite(C[j, j])
         if not finite:
             log_w[i] = -np.inf
-            for a in range(nx):
-                for b in range(nx):
-                    P[a, b] = 0.0
+            P[:] = 0.0
             lost += 1
             continue
         for a in range(nx):
             x[a] = forward[a]
-            for b in range(nx):
-                P[a, b] = C[a, b]
+        copy(C, P)
         wrap_record(circular, x)
     block_of(context, shared, number).sums[0] = lost
 
@@ -244,8 +236,7 @@ def refer(context, sensor, u, state, reference):
             finite &= np.isfinite(reference[k])
         if finite:
             return
-    for k in range(reference.size):
-        reference[k] = 0.0
+    reference[:] = 0.0
 
 
 @jit

@@ -30,9 +30,10 @@ from ..gaussian.shared import tell
 from ..interpreted.fold_loop import UNSET
 from ..log import INPUT, RESET
 from ..numerics.jit import B1, F1, F2, I1, borrowed, i64, inlined, jit
+from ..numerics.linalg import copy
 from ..numerics.workspace import size_of
 from ..snapshots import Snapshot
-from .notes import STAYED, StepNote, changed, copy, cut, join_moments, step_at, step_back, step_layout, widened
+from .notes import STAYED, StepNote, changed, cut, join_moments, step_at, step_back, step_layout, widened
 from .recorder import (
     ROW,
     StepRecorder,

@@ -24,7 +24,7 @@ from ..compiled.context import circular_states
 from ..events.maintenance import without
 from ..gaussian.shared import wrap_mean
 from ..numerics.jit import inlined, jit
-from ..numerics.linalg import root, wrap
+from ..numerics.linalg import copy, root, wrap
 from ..numerics.workspace import declare_layout
 
 STAYED, MOVED, CUT = range(3)  # Effect of an event on the state before any update: none; predicted; restarted or lost
@@ -42,6 +42,18 @@ def step_at(tape, row, n, own):
     """Return a note of a tape that begins at an address."""
     first = step_layout(0, n, own)
     return step_layout(tape + row * first.end, n, own)
+
+
+@inlined
+def multiply(A, B, out):
+    """Fill out = A B of square matrices."""
+    n = A.shape[0]
+    for i in range(n):
+        for j in range(n):
+            s = 0.0
+            for k in range(n):
+                s += A[i, k] * B[k, j]
+            out[i, j] = s
 
 
 @inlined
@@ -72,12 +84,11 @@ def solve_semidefinite(U, C, W):
 def cut(own, x, P):
     """Note that later measurements carry no information on the state N(x, P) before the event."""
     own.kind[0] = CUT
+    own.G[:] = 0.0
+    copy(P, own.M)
     for i in range(x.size):
         own.before[i] = x[i]
         own.after[i] = x[i]
-        for j in range(x.size):
-            own.G[i, j] = 0.0
-            own.M[i, j] = P[i, j]
 
 
 @jit
@@ -97,17 +108,11 @@ def join(own, x, P, after, G, W, T):
         own.kind[0] = MOVED
         for i in range(n):
             own.before[i] = x[i]
-            for j in range(n):
-                own.G[i, j] = G[i, j]
-                own.M[i, j] = P[i, j]
+        copy(G, own.G)
+        copy(P, own.M)
         return
     turn(own.G, P, own.M, T)
-    for i in range(n):
-        for j in range(n):
-            s = 0.0
-            for k in range(n):
-                s += own.G[i, k] * G[k, j]
-            T[i, j] = s
+    multiply(own.G, G, T)
     copy(T, own.G)
 
 
@@ -122,21 +127,12 @@ def finite(own):
     return np.isfinite(total)
 
 
-@inlined
-def copy(A, B):
-    """B ← A."""
-    for i in range(A.shape[0]):
-        for j in range(A.shape[1]):
-            B[i, j] = A[i, j]
-
-
 @jit
 def turn(G, P, M, T):
     """M ← M + G P Gᵀ for symmetric P and M; T (nx, nx) is scratch."""
     n = P.shape[0]
+    T[:] = 0.0
     for i in range(n):
-        for j in range(n):
-            T[i, j] = 0.0
         for k in range(n):
             a = G[i, k]
             for j in range(n):
@@ -207,13 +203,9 @@ def join_moments(note, P, out):
 
     Source: Särkkä, Bayesian Filtering and Smoothing (2013), theorem 12.4 and (12.49).
     """
-    n = P.shape[0]
-    for i in range(n):
-        for j in range(n):
-            if note.kind[0] == MOVED:
-                s = 0.0
-                for k in range(n):
-                    s += note.G[i, k] * P[k, j]
-                out[i, j] = s
-            else:
-                out[i, j] = P[i, j] if note.kind[0] == STAYED else np.nan
+    if note.kind[0] == MOVED:
+        multiply(note.G, P, out)
+    elif note.kind[0] == STAYED:
+        copy(P, out)
+    else:
+        out[:] = np.nan

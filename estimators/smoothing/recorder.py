@@ -13,8 +13,6 @@ points.
 
 from __future__ import annotations
 
-from typing import Any, NamedTuple
-
 import numpy as np
 
 from ..compiled.context import circular_states, options, transition_points
@@ -38,55 +36,25 @@ from ..estimator import (
 )
 from ..gaussian.kf import constant_jacobian, kept
 from ..gaussian.shared import moments_of
-from ..gaussian.ukf import deviations, weights_of
+from ..gaussian.ukf import deviations, subtract_opposite, weights_of
 from ..numerics.jit import address, floats, inlined, ints, jit
-from ..numerics.linalg import root
+from ..numerics.linalg import copy, multiply_transposed, root
 from ..numerics.simd_ir import padded
 from ..numerics.simd_rows import cross_covariance, factor, spread_points
-from ..numerics.workspace import declare_layout, layout, size_of, take_matrix, take_vector
-from .notes import CUT, STAYED, copy, cut, finite, join, solve_semidefinite, step_at, step_layout
+from ..numerics.workspace import declare_layout, size_of
+from .notes import CUT, STAYED, cut, finite, join, solve_semidefinite, step_at, step_layout
 
 START, PREDICT, UPDATE, DESCRIBE, OWN, RULE, HELD, ROW, TAPE, SCRATCH, HEAD = range(11)
 """Positions in the head: addresses of the filter's functions, length of its state, prediction rule, form of its
 covariance, row of the tape that is written, addresses of tape and scratch."""
 
 
-class CrossScratch(NamedTuple):
-    """Scratch of the cross-covariance.
-
-    `kept` is df/dx, with the scratch of a Jacobian; chol_P (n, padded n) is upper, chol_Pᵀ chol_P = P; sigma
-    (2n + 1, padded n) are the sigma points; D the same through f, then their deviations from the mean; `across`
-    (n, padded n) are the differences between opposite ones, in the place of the first of each pair.
-    """
-
-    kept: Any
-    jacobian: Any
-    chol_P: Any
-    sigma: Any
-    D: Any
-    across: Any
-    mean: Any
-    end: int
-
-
-@layout
-def crossing(at, n):
-    """Lay it out."""
-    F = kept(at, n)
-    jacobian, at = take_vector(F.end, scratch_size(n, n))
-    chol_P, at = take_matrix(at, n, padded(n))
-    sigma, at = take_matrix(at, 2 * n + 1, padded(n))
-    _, second = take_vector(at, padded(n))
-    across, _ = take_matrix(second, n, padded(n))
-    D, at = take_matrix(at, 2 * n + 1, padded(n))
-    mean, at = take_vector(at, padded(n))
-    return CrossScratch(F, jacobian, chol_P, sigma, D, across, mean, at)
-
-
 Noting, noting_layout = declare_layout(
     "Noting",
     "n, N",
-    crossing,
+    kept,
+    scratch_size,
+    padded,
     x="n",
     P="n, n",
     P_found="n, n",
@@ -96,10 +64,20 @@ Noting, noting_layout = declare_layout(
     T="n, n",
     after="n",
     X="N, n",
-    cross="crossing(at, n)",
+    kept="Kept(at, n)",
+    jacobian="scratch_size(n, n)",
+    chol_P="n, padded(n)",
+    sigma="2 * n + 1, padded(n)",
+    D="2 * n + 1, padded(n)",
+    across="n, padded(n) = D + padded(n)",
+    mean="padded(n)",
 )
 """Scratch of a note: m; P; P at the start of the event; P⁻, then its factor; Cov(x, x⁻), then G of the step; U⁻ᵀ Cᵀ,
-for U of P⁻; a product; m⁻; the N members before the step, of an ensemble; the cross-covariance."""
+for U of P⁻; a product; m⁻; the N members before the step, of an ensemble.
+
+For the cross-covariance: df/dx, with the scratch of a Jacobian; upper chol_P, chol_Pᵀ chol_P = P; the sigma points; D,
+the same through f, then their deviations from the mean; `across`, the differences between opposite ones, in the place
+of the first of each pair; the mean."""
 
 
 @inlined
@@ -128,9 +106,7 @@ def members_covariance(X, x, Y, y, C):
     for j in range(n):
         x[j] = column_mean(X, j)
         y[j] = column_mean(Y, j)
-    for i in range(n):
-        for j in range(n):
-            C[i, j] = 0.0
+    C[:] = 0.0
     for k in range(N):
         for i in range(n):
             a = (X[k, i] - x[i]) / (N - 1)
@@ -162,18 +138,12 @@ def covariance_of(context, state, holds, x, P):
 @jit
 def by_tangent(context, rule, x, u, dt, P, own, C):
     """C (nx, nx) = P Fᵀ."""
-    n = x.size
     F = own.kept.F
     if rule == CONSTANT:
         constant_jacobian(context, u, dt, own.kept, own.jacobian)
     else:
         state_jacobian(context, x, u, dt, F, own.jacobian)
-    for i in range(n):
-        for j in range(n):
-            s = 0.0
-            for k in range(n):
-                s += P[i, k] * F[j, k]
-            C[i, j] = s
+    multiply_transposed(P, F, C)
 
 
 @jit
@@ -184,9 +154,7 @@ def by_points(context, x, u, dt, own, C):
     spread_points(x, own.chol_P, w.spread, own.sigma)
     transition_points(context, own.sigma, u, dt, own.D)
     deviations(own.D, w.outer, circular_states(context), own.mean)
-    for k in range(n):
-        for j in range(n):
-            own.across[k, j] -= own.D[1 + n + k, j]
+    subtract_opposite(own.D, n, own.across)
     cross_covariance(own.chol_P, own.across, w.outer * w.spread, C)
 
 
@@ -195,9 +163,7 @@ def take_factor(P, U, rooted, own):
     """Fill own.chol_P: from U, if the state holds a factor, otherwise from P; False if P has none."""
     if not rooted:
         return factor(P, own.chol_P)
-    for i in range(U.shape[0]):
-        for j in range(U.shape[1]):
-            own.chol_P[i, j] = U[i, j]
+    copy(U, own.chol_P)
     return True
 
 
@@ -233,11 +199,11 @@ def predict(context, u, dt, index, state, work):
         copy(ensemble(context, own), places.X)
     elif head[RULE] == POINTS:
         _, held = moments_of(own, n)
-        good = take_factor(P, held, holds == FACTOR, places.cross)
+        good = take_factor(P, held, holds == FACTOR, places)
         if good:
-            by_points(context, x, u, dt, places.cross, C)
+            by_points(context, x, u, dt, places, C)
     else:
-        by_tangent(context, head[RULE], x, u, dt, P, places.cross, C)
+        by_tangent(context, head[RULE], x, u, dt, P, places, C)
     call_predict(head[PREDICT], context, u, dt, index, own, work)
     covariance_of(context, own, holds, places.after, places.ahead)
     if holds == MEMBERS:
