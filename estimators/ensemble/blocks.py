@@ -13,12 +13,13 @@ from ..compiled.context import context_at, place_of
 from ..compiled.context import options as numbers
 from ..estimator import Option
 from ..numerics.jit import jit, matrix
+from ..numerics.linalg import copy
 from ..numerics.random import key_of, normal
 from ..numerics.simd import WIDE, add_scaled, added, combine_rows, copied, spread_rows
 from ..numerics.simd_ir import LANES
 from ..numerics.workspace import declare_layout, line_from, share, start_of
 from .localisation import localised, reached
-from .shared import CREWS, INFLATION, OWN, ROTATE
+from .shared import CREWS, OWN, ROTATE
 
 
 @jit
@@ -52,13 +53,11 @@ def load(X, first, count, width, block):
     """Copy a block out of the ensemble: anomalies in rows 0 to N - 1, the mean in row N."""
     N = X.shape[0]
     mean = block[N]
-    for j in range(width):
-        mean[j] = 0.0
+    mean[:] = 0.0
     for i in range(N):
         row = block[i]
         copied(count, X[i, first:], row)
-        for j in range(count, width):
-            row[j] = 0.0
+        row[count:] = 0.0
         # About the first member, so that a spread far below the size of the numbers keeps its digits.
         if i > 0:
             add_scaled(width, -1.0, block[0], row)
@@ -148,11 +147,8 @@ def regress(context, sensor, X, places, ZT, B, serial, inflation, crew, crews, s
         seen = block
         if not serial:
             seen = forecast
-            for i in range(N):
-                for j in range(width):
-                    seen[i, j] = block[i, j]
-        for j in range(width):
-            reach[j] = 0.0 if local else 1.0
+            copy(block[:N], seen)
+        reach[:] = 0.0 if local else 1.0
         begin, end = (starts[e], starts[e + 1]) if local else (0, places.size)
         for entry in range(begin, end):
             k = places[entry_rows[entry] if local else entry]
@@ -233,18 +229,15 @@ def rotate_members(seed, index, T, W):
         for i in range(N):
             for j in range(i):
                 Q[i, j], Q[j, i] = Q[j, i], Q[i, j]
+    W[:] = 0.0
     for i in range(N):
-        for j in range(N):
-            W[i, j] = 0.0
         for k in range(N):
             add_scaled(N, Q[i, k], T[k], W[i])
-    for i in range(N):
-        for j in range(N):
-            T[i, j] = W[i, j]
+    copy(W[:, :N], T)
 
 
 @jit
-def transform_members(context, index, a, X, rest):
+def transform_members(context, index, a, X, inflation, rest):
     """x̄ + A ← x̄ + (T + 1 wᵀ) A for all states, with T (N, N) and v = √(N - 1) w of the analysis; rotate and inflate."""
     N = X.shape[0]
     T, W, v = a.T, a.W, a.v
@@ -254,25 +247,22 @@ def transform_members(context, index, a, X, rest):
     # W = T + 1 wᵀ, by which x̄ + W A are the members
     for i in range(N):
         for j in range(N):
-            W[i, j] = given[INFLATION] * T[i, j] + v[j] / np.sqrt(N - 1.0)
+            W[i, j] = inflation * T[i, j] + v[j] / np.sqrt(N - 1.0)
         W[i, N] = 1.0
     transform_all(X, W, int(given[CREWS]), rest)
 
 
 @jit
 def rotate(context, index, X, a, rest):
-    """Rotate the members X (N, n), where the option is set; T (N, N) and W (N, N + 1) of the analysis are scratch."""
-    given = numbers(context)
-    if given[OWN] == 0.0:
-        return
-    N = X.shape[0]
-    T, W = a.T, a.W
-    for i in range(N):
-        for j in range(N):
-            T[i, j] = 1.0 if i == j else 0.0
-    rotate_members(context.seed, index, T, W)
-    for i in range(N):
-        for j in range(N):
-            W[i, j] = T[i, j]
-        W[i, N] = 1.0
-    transform_all(X, W, int(given[CREWS]), rest)
+    """Rotate the members X (N, n), where the option is set; T, v and W of the analysis are scratch."""
+    if numbers(context)[OWN] > 0.0:
+        identity(a.T, a.v)
+        transform_members(context, index, a, X, 1.0, rest)
+
+
+@jit
+def identity(T, v):
+    """Set the transform T to the identity, and v to zero."""
+    T[:], v[:] = 0.0, 0.0
+    for i in range(T.shape[0]):
+        T[i, i] = 1.0

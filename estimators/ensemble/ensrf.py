@@ -21,7 +21,7 @@ from ..numerics.jit import jit
 from ..numerics.simd import add_scaled, combine, dot
 from ..track import USED
 from .analysis import begin_analysis, find_places, reconsider, work_size
-from .blocks import ROTATION, regress_all, rotate, transform_members
+from .blocks import ROTATION, identity, regress_all, rotate, transform_members
 from .localisation import between_rows, localised, prepare
 from .shared import CREWS, INFLATION, RADIUS, describe, ensemble_filter, finish, next_draw, predict, start
 
@@ -62,10 +62,7 @@ def row_transform(m, a):
     ZT, T, v = a.ZT, a.T, a.v
     N = ZT.shape[1]
     z, back = a.W[0], a.W[1]
-    for i in range(N):
-        v[i] = 0.0
-        for j in range(N):
-            T[i, j] = 1.0 if i == j else 0.0
+    identity(T, v)
     for k in range(m):
         for i in range(N):
             z[i] = dot(N, T[i], ZT[k])
@@ -98,7 +95,7 @@ def update(context, u, sensor, y, index, state, work, innovation, innovation_std
         rotate(context, index, X, a, rest)
     else:
         row_transform(m, a)
-        transform_members(context, index, a, X, rest)
+        transform_members(context, index, a, X, given[INFLATION], rest)
     reconsider(context, index, X)
     finish(context, index, X, rest)
     return USED

@@ -16,13 +16,14 @@ from __future__ import annotations
 
 import numpy as np
 
+from ..compiled.context import options as numbers
 from ..numerics.jit import jit
 from ..numerics.simd import add_scaled
 from ..numerics.symmetric import gram, symmetric_eigen
 from ..track import FAILED, USED
 from .analysis import begin_analysis, reconsider, work_size
-from .blocks import ROTATION, transform_members
-from .shared import describe, ensemble_filter, finish, next_draw, predict, start
+from .blocks import ROTATION, identity, transform_members
+from .shared import INFLATION, describe, ensemble_filter, finish, next_draw, predict, start
 
 
 @jit
@@ -40,20 +41,14 @@ def symmetric_transform(m, a):
     """
     ZT, Z, d, G, V, values, small, v, B, T = a.ZT, a.Z, a.d, a.G, a.V, a.values, a.small, a.v, a.B, a.T
     N = ZT.shape[1]
-    for i in range(N):
-        v[i] = 0.0
-        for j in range(N):
-            T[i, j] = 0.0
     if m < N:
+        identity(T, v)
         gram(Z, N, m, G)
         if not symmetric_eigen(G, m, values, V, small):
             return False
-        for i in range(N):
-            T[i, i] = 1.0
         for k in range(m):
             b = B[k]
-            for i in range(N):
-                b[i] = 0.0
+            b[:] = 0.0
             innovation = 0.0
             for j in range(m):
                 add_scaled(N, V[k, j], ZT[j], b)
@@ -64,12 +59,12 @@ def symmetric_transform(m, a):
             for i in range(N):
                 add_scaled(N, -phi * b[i], b, T[i])
         return True
+    v[:], T[:] = 0.0, 0.0
     gram(ZT, m, N, G)
     if not symmetric_eigen(G, N, values, V, small):
         return False
     g = small[:N]
-    for i in range(N):
-        g[i] = 0.0
+    g[:] = 0.0
     for k in range(m):
         add_scaled(N, d[k], ZT[k], g)
     for k in range(N):
@@ -101,7 +96,7 @@ def update(context, u, sensor, y, index, state, work, innovation, innovation_std
     # T = (I + Z Zᵀ)^(-1/2),  w = (I + Z Zᵀ)⁻¹ Z d / √(N - 1)
     if not symmetric_transform(m, a):
         return FAILED
-    transform_members(context, index, a, X, rest)
+    transform_members(context, index, a, X, numbers(context)[INFLATION], rest)
     reconsider(context, index, X)
     finish(context, index, X, rest)
     return USED

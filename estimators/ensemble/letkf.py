@@ -140,12 +140,11 @@ def transform_columns(context, sensor, X, places, ZT, d, C, inflation, crew, cre
         load(X, first, count, width, block)
         z, across = matrix(room.z, 0, rows, N), matrix(room.across, 0, N, rows)
         t, x = matrix(room.t, 0, rows, width), matrix(room.x, 0, rows, width)
+        x[:] = 0.0
         for k in range(rows):
             for i in range(N):
                 z[k, i] = ZT[near[k], i]
                 across[i, k] = z[k, i]
-            for j in range(width):
-                x[k, j] = 0.0
         multiply_rows(z, rows, N, block, 0, t)
         for at in range(0, width, LANES):
             p = near_group(rows, at, room.roots, room.own, room.own_roots)
@@ -202,7 +201,7 @@ def update(context, u, sensor, y, index, state, work, innovation, innovation_std
         transform_locally(context, sensor, X, a, given[INFLATION], int(given[CREWS]), rest)
         rotate(context, index, X, a, rest)
     elif symmetric_transform(m, a):
-        transform_members(context, index, a, X, rest)
+        transform_members(context, index, a, X, given[INFLATION], rest)
     else:
         return FAILED
     reconsider(context, index, X)
