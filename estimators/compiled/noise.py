@@ -25,9 +25,7 @@ _SMALL = 1e-13
 @jit
 def _not_semidefinite(L):
     """Fill L with NaN, so that the failure shows in every result."""
-    for i in range(L.shape[0]):
-        for k in range(L.shape[1]):
-            L[i, k] = np.nan
+    L[:] = np.nan
     return False
 
 
@@ -40,9 +38,7 @@ def semidefinite_root(A, L):
     Source: Higham (2002), Accuracy and Stability of Numerical Algorithms, 2nd edition, 10.3.
     """
     n = A.shape[0]
-    for i in range(n):
-        for j in range(n):
-            L[i, j] = 0.0
+    L[:] = 0.0
     for j in range(n):
         pivot = A[j, j]
         for k in range(j):
@@ -108,19 +104,14 @@ def noise_root(context, x, u, dt, L, scratch):
 
     Where `context.Q_varies` is 0, the result does not depend on x, and one call serves all members of a step.
     """
-    n = L.shape[0]
     if context.Q == 0:
-        for i in range(n):
-            for j in range(n):
-                L[i, j] = 0.0
+        L[:] = 0.0
         q = process_variances(context)
         state = ints(context.noise_state, context.n_noises)
         for k in range(q.size):
             L[state[k], state[k]] = np.sqrt(q[k] * dt)
         return
-    for i in range(n):
-        for j in range(n):
-            scratch[i, j] = 0.0
+    scratch[:] = 0.0
     call_Q(context.Q, x, u, parameters(context), process_variances(context), dt, scratch)
     semidefinite_root(scratch, L)
 

@@ -76,8 +76,7 @@ def work_size(options: Options, nx: int, ny: int, task: int = 0) -> int:
 @jit
 def find_places(m, rows, places):
     """Fill for each row of a measurement its index among the m finite ones, or -1."""
-    for k in range(places.size):
-        places[k] = -1
+    places[:] = -1
     for k in range(m):
         places[rows[k]] = k
 
@@ -226,8 +225,7 @@ def judge_reading(context, sensor, m, a, score):
         gram(ZT, m, N, G)
         if not factor(G, N, U):
             return FAILED
-        for i in range(N):
-            v[i] = 0.0
+        v[:] = 0.0
         for k in range(m):
             add_scaled(N, d[k], ZT[k], v)
         solve_transposed(U, N, v)

@@ -56,9 +56,8 @@ def weights(m, a, inflation):
     N = ZT.shape[1]
     if m <= N:
         solve_rows(U, m, B, N)
+    T[:] = 0.0
     for j in range(N):
-        for i in range(N):
-            T[j, i] = 0.0
         for k in range(m):
             add_scaled(N, Z[j, k], B[k], T[j])
     if m > N:
@@ -74,8 +73,7 @@ def weights(m, a, inflation):
         for i in range(N):
             own = T[j, i] + (1.0 if i == j else 0.0)
             W[i, j] = common + inflation * (own - common)
-    for i in range(N):
-        W[i, N] = 1.0
+    W[:, N] = 1.0
 
 
 @jit

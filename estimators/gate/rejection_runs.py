@@ -59,10 +59,8 @@ def fresh(sensors: int) -> np.ndarray:
 @inlined
 def forget(doubt):
     """Clear the state at a reset."""
-    for s in range(doubt.shape[0]):
-        for k in range(doubt.shape[1]):
-            doubt[s, k] = 0.0
-        doubt[s, DUE] = -np.inf
+    doubt[:] = 0.0
+    doubt[:, DUE] = -np.inf
 
 
 @inlined

@@ -115,9 +115,7 @@ def describe(context, state, mean, std, cross):
 def noise_root(context, x, u, dt, state, V, scratch):
     """Fill V (nx, nx) with a factor of Q, as scaled by an adaptation; False if Q is indefinite."""
     n = context.nx
-    for i in range(n):
-        for j in range(n):
-            V[i, j] = 0.0
+    V[:] = 0.0
     add_process_noise(context, x, u, dt, V, scratch)
     # Considered states have no noise.
     if not root(V, V, estimated(context)):
@@ -298,8 +296,7 @@ def take_over(m, nu, A, estimated, x, U):
     if estimated < n:
         for i in range(m):
             lost = A[i, m:]
-            for j in range(estimated):
-                lost[j] = 0.0
+            lost[:estimated] = 0.0
             add_square(U, n, lost)
 
 

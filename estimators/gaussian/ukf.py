@@ -113,8 +113,7 @@ def predict(context, u, dt, index, state, work):
     own = predicting(start_of(work), n)
     w = weights_of(context)
     if not factor(P, own.chol_P):
-        for i in range(n + n * n):
-            state[i] = np.nan
+        state[: n + n * n] = np.nan
         return
     spread_points(x, own.chol_P, w.spread, own.sigma)
     transition_points(context, own.sigma, u, dt, own.D)

@@ -108,17 +108,15 @@ def symmetric_eigen(A, n, values, V, scratch):
     """
     halves = scratch[2 * n : 3 * n]
     tridiagonal(A, n, values, halves, scratch)
+    V[:n, :n] = 0.0
     for i in range(n):
-        for j in range(n):
-            V[i, j] = 0.0
         V[i, i] = 1.0
     # Applied from the first reflection on, the rows of V become those of H.
     w = scratch[n : 2 * n]
     for k in range(n - 2):
         if halves[k] == 0.0:
             continue
-        for j in range(n):
-            w[j] = 0.0
+        w[:] = 0.0
         for j in range(k + 1, n):
             add_scaled(n, A[k, j], V[j], w)
         for j in range(k + 1, n):
@@ -147,8 +145,7 @@ def tridiagonal(A, n, d, halves, scratch):
         d[k] = A[k, k]
         first = begin(k)
         size = n - first
-        for j in range(first, k + 1):
-            A[k, j] = 0.0
+        A[k, first : k + 1] = 0.0
         row, v = A[k, first:], A[k, k + 1 :]
         head = A[k, k + 1]
         A[k, k + 1] = 0.0

@@ -215,8 +215,7 @@ def weigh_block(context, u, dt, sensor, y, key, value, state, work, number):
         for row in range(ny):
             for i in range(count):
                 D[row, i] = y[row] - expected[i, row]
-        for i in range(count):
-            joint[begin + i] = constant
+        joint[begin : begin + count] = constant
         k = 0
         for row in range(ny):
             if not np.isfinite(y[row]):
@@ -244,8 +243,7 @@ def weigh_block(context, u, dt, sensor, y, key, value, state, work, number):
                 joint[begin + i] = own_likelihood(context, sensor, y, records[begin + i, : context.nx], u)
         # Row m + 1 is free for the weights until the sums are made.
         if equal:
-            for i in range(count):
-                D[m + 1, i] = 1.0
+            D[m + 1, :count] = 1.0
         else:
             exp_minus(count, log_w[begin:], 0.0, D[m + 1])
         copied(count, D[m + 1], D[m])

@@ -129,9 +129,7 @@ def move_block(context, u, dt, sensor, y, key, value, state, work, number):
         else:
             log_w[i] = -np.inf
             lost += 1
-            for j in range(nx):
-                for k in range(nx):
-                    P[j, k] = 0.0
+            P[:] = 0.0
     block_of(context, shared, number).sums[0] = lost
 
 
@@ -248,9 +246,7 @@ def place_draw(context, sensor, u, y, x, L, z, G, d, seen):
 @inlined
 def settle_draw(P, value, i, joint, sums):
     """Set the covariance of a drawn member to zero, and its joint log weight to `value`, or -inf if that is NaN."""
-    for a in range(P.shape[0]):
-        for b in range(P.shape[0]):
-            P[a, b] = 0.0
+    P[:] = 0.0
     if not -np.inf < value < np.inf:
         value = -np.inf
     joint[i] = value
