@@ -95,7 +95,6 @@ def _largest_row(v, n, d, e, largest):
     builder = v.builder
     d, e, largest = LaneRows(v, d), LaneRows(v, e), LaneRows(v, largest)
     most = v.variable()
-    builder.store(v.constant(0.0), most)
     with steps(builder, 0, n) as i:
         beside = builder.fadd(v.unary("fabs", e[i]), v.unary("fabs", e[builder.add(i, integer(1))]))
         total, found = builder.fadd(v.unary("fabs", d[i]), beside), builder.load(most)
@@ -187,9 +186,7 @@ def root_action(A, n, b, g, inverse_root, room, product):
         product: Gets bᵀ (I + A)⁻¹ g of the b given (LANES,); NaN if a number is not finite.
     """
     d, e, inverses, w, x, largest, rest, _ = room
-    for lane in range(LANES):
-        e[0, lane] = 0.0
-        e[n, lane] = 0.0
+    e[0], e[n] = 0.0, 0.0
     for k in range(n - 2):
         find_reflection(n, k, A, d, e, inverses)
         multiply(n, k, A, w)

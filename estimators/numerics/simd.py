@@ -124,9 +124,7 @@ def _combining(rows: int, subtract: bool = False) -> Any:
         def write(v: Lanes, at: Any) -> None:
             builder = v.builder
             to = [builder.gep(out.data, [builder.mul(width, integer(i))]) for i in range(rows)]
-            sums = [v.variable() for _ in range(rows)]
-            for total, row in zip(sums, to, strict=True):
-                builder.store(v.load(row, at) if subtract else v.constant(0.0), total)
+            sums = [v.variable(v.load(row, at) if subtract else None) for row in to]
             with cgutils.for_range(builder, count) as loop:
                 weight = builder.gep(weights.data, [builder.mul(loop.index, apart)])
                 value = v.load(builder.gep(x.data, [builder.mul(loop.index, stride)]), at)

@@ -100,7 +100,7 @@ class Lanes:
         return self.spread(self.builder.load(self.builder.gep(base, [index])))
 
     def variable(self, value: Any = None) -> Any:
-        """Return memory for a vector, set to `value` or zero."""
+        """Return memory for a vector, set to `value` or zero here, so in a loop each time."""
         place = cgutils.alloca_once(self.builder, self.kind)
         self.builder.store(self.constant(0.0) if value is None else value, place)
         return place

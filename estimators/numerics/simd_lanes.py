@@ -47,8 +47,6 @@ def _sums(v: Lanes, begin: Any, end: Any, terms: Callable[[Any], list[tuple[Any,
     """Return `count` sums over i of products: terms(i) returns their factors. Four numbers i at a time."""
     builder = v.builder
     parts = [[v.variable() for _ in range(4)] for _ in range(count)]
-    for total in (one for own in parts for one in own):
-        builder.store(v.constant(0.0), total)
 
     def add(i: Any, height: int) -> None:
         for k in range(height):
@@ -97,9 +95,7 @@ def multiply(v, n, k, A, w):
         rows = [builder.add(i, integer(r)) for r in range(height)]
         bases = [builder.mul(r, n) for r in rows]
         own = [A[builder.add(row, r)] for r in rows]
-        sums = [v.variable() for _ in rows]
-        for r, total in zip(rows, sums, strict=True):
-            builder.store(w[r], total)
+        sums = [v.variable(w[r]) for r in rows]
         for r in range(height):
             v.multiply_add_to(sums[r], A[builder.add(bases[r], rows[r])], own[r])
             for c in range(r + 1, height):
@@ -229,8 +225,6 @@ def weighted_gram(v, count, own, tapers, Z, n, G):
 
     def tile(i: Any, j: Any, height: int, across: int) -> None:
         sums = [[v.variable() for _ in range(across)] for _ in range(height)]
-        for one in (one for row in sums for one in row):
-            builder.store(v.constant(0.0), one)
         with steps(builder, 0, count) as k:
             row = builder.gep(Z.data, [builder.mul(builder.load(builder.gep(own.data, [k])), width)])
             weight = tapers[k]
