@@ -18,10 +18,10 @@ from typing import Any
 import numpy as np
 
 from ..compiled.context import options as numbers
-from ..compiled.context import shown_states
 from ..estimator import Option, Options
+from ..gaussian.shared import tell
 from ..model.state_space import StateSpaceModel
-from ..numerics.jit import ints, jit, matrix, threaded
+from ..numerics.jit import jit, matrix, threaded
 from ..numerics.linalg import wrap
 from ..numerics.peaks import Peak, peaks_of
 from ..numerics.simd import copied, dot, exp_minus, total, weighted
@@ -207,12 +207,9 @@ SHARED: dict[str, Any] = {
 def weigh_equally(context, state):
     """Give every particle the weight 1/N."""
     log_w = own_cloud(context, state).log_w
-    n = log_w.size
-    equal = -np.log(n)
-    for i in range(n):
-        log_w[i] = equal
+    log_w[:] = -np.log(log_w.size)
     state[EQUAL] = 1.0
-    state[ESS] = n
+    state[ESS] = log_w.size
 
 
 @jit
@@ -289,8 +286,7 @@ def tails_of(context, sums):
 @jit
 def clear_sums(sums):
     """Set the sums to zero and the largest log weight to -inf."""
-    for k in range(sums.size):
-        sums[k] = 0.0
+    sums[:] = 0.0
     sums[2] = -np.inf
 
 
@@ -395,11 +391,4 @@ def describe(context, state, mean, std, cross):
     n = context.nx
     x, cov = np.empty(n), np.empty((n, n))
     cloud_moments(state, n, count_of(context), x, cov)
-    shown = shown_states(context)
-    for k in range(mean.size):
-        i = shown[k]
-        mean[k] = x[i]
-        std[k] = np.sqrt(cov[i, i])
-    pairs = ints(context.pairs, 2 * context.n_pairs)
-    for k in range(cross.size):
-        cross[k] = cov[pairs[2 * k], pairs[2 * k + 1]]
+    tell(context, x, cov, mean, std, cross)

@@ -72,8 +72,7 @@ def drawn_children(scheme, key, w, total, children):
     """Fill `children` (N,) by residual or multinomial resampling; `w` is overwritten by the residual one."""
     n = w.size
     if scheme == MULTINOMIAL:
-        for i in range(n):
-            children[i] = 0.0
+        children[:] = 0.0
         _draw_children(key, w, total, n, children)
         return
     given = 0.0
@@ -119,25 +118,17 @@ def ancestors_of(children, first, ancestors):
 
 
 @jit
-def take_later(ancestors, rows):
-    """Replace each row (N, k) by its ancestor's, in place, where that stands behind it; see `take_ancestors`."""
+def take(ancestors, rows, later):
+    """Replace each row (N, k) by its ancestor's, in place, where that stands behind it, or else before it.
+
+    See `take_ancestors`.
+    """
     n, width = rows.shape
     flat = rows.reshape(n * width)
-    for k in range(n):
+    for i in range(n):
+        k = i if later else n - 1 - i
         parent = ancestors[k]
-        if parent > k:
-            for j in range(width):
-                flat[k * width + j] = flat[parent * width + j]
-
-
-@jit
-def take_earlier(ancestors, rows):
-    """Replace each row (N, k) by its ancestor's, in place, where that stands before it; see `take_ancestors`."""
-    n, width = rows.shape
-    flat = rows.reshape(n * width)
-    for k in range(n - 1, -1, -1):
-        parent = ancestors[k]
-        if parent < k:
+        if parent > k if later else parent < k:
             for j in range(width):
                 flat[k * width + j] = flat[parent * width + j]
 
@@ -149,21 +140,14 @@ def take_ancestors(ancestors, rows):
     Later ancestors are copied from the front, earlier ones from the end: since ancestors never fall, none is
     overwritten before its last child is copied, neither within a pass nor by the other, so that both may run at once.
     """
-    take_later(ancestors, rows)
-    take_earlier(ancestors, rows)
+    take(ancestors, rows, True)
+    take(ancestors, rows, False)
 
 
 @jit(parallel=True)
 def _take_on_threads(ancestors, records, lineage):
     for task in prange(4):
-        if task == 0:
-            take_later(ancestors, records)
-        elif task == 1:
-            take_earlier(ancestors, lineage)
-        elif task == 2:
-            take_earlier(ancestors, records)
-        else:
-            take_later(ancestors, lineage)
+        take(ancestors, records if task % 2 == 0 else lineage, task == 0 or task == 3)
 
 
 @jit
