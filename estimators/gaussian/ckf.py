@@ -9,14 +9,16 @@ Source: Arasaratnam & Haykin (2009), doi:10.1109/TAC.2009.2019800.
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 
-from ..estimator import POINTS, Estimator, Options, SmoothingRule
+from ..estimator import Options
 from ..model.state_space import StateSpaceModel
 from ..tuning import Tuning
-from .robust import OPTIONS, memory, shared_options
-from .shared import describe, moments, start, state_size
-from .ukf import predict, sigma_points, update, weights, work_size
+from .robust import OPTIONS, shared_options
+from .shared import moments
+from .ukf import UKF, sigma_points, weights
 
 
 def tune(values: Options, model: StateSpaceModel, tuning: Tuning) -> np.ndarray:
@@ -29,24 +31,14 @@ def points(values: Options, state: np.ndarray, nx: int) -> np.ndarray:
     return sigma_points(*moments(values, state, nx), np.sqrt(nx))[1:]
 
 
-CKF = Estimator(
+CKF = replace(
+    UKF,
     name="ckf",
     title="Cubature Kalman filter",
-    family="Gaussian",
-    assumes="f and h smooth within the spread; posterior well described by mean and covariance",
-    model_runs="2 nx + 1",
     fails_when="the points, √nx standard deviations out, leave where the model holds; or several peaks",
     source="Arasaratnam & Haykin (2009), doi:10.1109/TAC.2009.2019800",
-    functions=(start, predict, update, describe),
-    runs=lambda options, nx: 2 * nx + 1,
-    state_size=state_size,
-    work_size=work_size,
-    moments=moments,
     points=points,
     options=OPTIONS,
-    needs_factor=True,
     tune=tune,
-    memory=memory,
-    smoothing=SmoothingRule(POINTS),
-    considers=True,
+    refuses=lambda model, options: None,
 )

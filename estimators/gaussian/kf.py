@@ -2,17 +2,19 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 from ..compiled.context import estimated, transition
 from ..compiled.jacobians import state_jacobian
-from ..estimator import CONSTANT, Estimator, Options, SmoothingRule
+from ..estimator import CONSTANT, Options, SmoothingRule
 from ..model.state_space import StateSpaceModel
 from ..numerics.jit import by_address, floats, inlined
 from ..numerics.linalg import congruence
 from ..numerics.workspace import declare_layout, size_of, start_of
 from . import ekf
-from .ekf import predicting
-from .robust import JOSEPH_OPTION, OPTIONS, add_noise, memory
-from .shared import describe, moments, moments_of, move_to, no_points, start, state_size
+from .ekf import EKF, predicting
+from .robust import add_noise
+from .shared import describe, moments_of, move_to, start
 
 Kept, kept = declare_layout(
     "Kept",
@@ -72,24 +74,18 @@ def applies(model: StateSpaceModel) -> str | None:
     return f"{model.name} is not linear{why}; use an extended or unscented Kalman filter: ekf, ukf, sr-ekf or sr-ukf"
 
 
-KF = Estimator(
+KF = replace(
+    EKF,
     name="kf",
     title="Kalman filter",
-    family="Gaussian",
     assumes="linear f and h, Gaussian noise; then exact",
     model_runs="1",
     fails_when="the model is wrong: the NIS leaves its bounds",
     source="Kalman (1960), doi:10.1115/1.3662552",
     functions=(start, predict, ekf.update, describe),
-    state_size=state_size,
+    runs=lambda options, nx: 1.0,
     work_size=work_size,
-    moments=moments,
-    points=no_points,
-    options=(JOSEPH_OPTION, *OPTIONS),
-    tune=ekf.tune,
-    memory=memory,
-    considers=True,
-    singular=True,
+    linearises=False,
     smoothing=SmoothingRule(CONSTANT),
     applies=applies,
 )

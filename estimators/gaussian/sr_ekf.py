@@ -14,7 +14,7 @@ from ..numerics.linalg import triangularise
 from ..numerics.workspace import declare_layout, size_of, start_of, take_matrix
 from .ekf import EKF
 from .robust import OPTIONS, growth
-from .shared import moments_of, move_to, state_size
+from .shared import moments_of, move_to
 from .square_root import condition, conditioning, describe, moments, noise_root, settle, start
 
 Predicting, predicting = declare_layout(
@@ -144,7 +144,6 @@ SR_EKF = replace(
     assumes="differentiable f and h, nearly straight within the spread of the estimate; any conditioning",
     source="Kailath, Sayed & Hassibi (2000), Linear Estimation, chapter 12",
     functions=(start, predict, update, describe),
-    state_size=state_size,
     work_size=work_size,
     moments=moments,
     smoothing=SmoothingRule(TANGENT, FACTOR),

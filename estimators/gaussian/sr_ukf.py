@@ -21,7 +21,7 @@ from ..numerics.simd_ir import padded
 from ..numerics.simd_rows import spread_points
 from ..numerics.workspace import declare_layout, size_of, start_of
 from .robust import growth
-from .shared import moments_of, state_size
+from .shared import moments_of
 from .square_root import condition, conditioning, describe, moments, noise_root, settle, start
 from .ukf import UKF, deviations, weights, weights_of
 
@@ -149,7 +149,6 @@ SR_UKF = replace(
     fails_when="a negative central weight outweighs the others, or the posterior has several peaks",
     source="van der Merwe & Wan (2001), doi:10.1109/ICASSP.2001.940586",
     functions=(start, predict, update, describe),
-    state_size=state_size,
     work_size=work_size,
     moments=moments,
     points=points,
