@@ -175,16 +175,25 @@ def weight(z: np.ndarray, data: tuple[np.ndarray, ...]) -> np.ndarray:
     return np.exp(-0.5 * beyond**2)
 
 
+def _feature(x, u, place):
+    """Return a feature, of the type of x."""
+    return x[place] if place >= 0 else u[-1 - place] + 0.0 * x[0]
+
+
+def _nearness(x, u, place, point, inverse):
+    """Return κ of one window."""
+    square = 0.0 * x[0]
+    for j in range(place.size):
+        off = _feature(x, u, place[j]) * inverse[j] - point[j]
+        square += off * off
+    return np.exp(-0.5 * square)
+
+
 def process_add(x, u, dt, place, target, data, out):
     """out[target] += dt m."""
     scaled, inverse, weights, _ = data
     for i in range(scaled.shape[0]):
-        near = 0.0 * x[0]
-        for j in range(place.size):
-            z = x[place[j]] if place[j] >= 0 else u[-1 - place[j]] + 0.0 * x[0]
-            off = z * inverse[j] - scaled[i, j]
-            near += off * off
-        near = np.exp(-0.5 * near)
+        near = _nearness(x, u, place, scaled[i], inverse)
         for c in range(target.size):
             out[target[c]] += dt * near * weights[i, c]
 
@@ -193,11 +202,7 @@ def process_slope(x, u, dt, place, target, data, out):
     """out[target, :] += dt ∂m/∂x."""
     scaled, inverse, weights, _ = data
     for i in range(scaled.shape[0]):
-        near = 0.0
-        for j in range(place.size):
-            z = x[place[j]] if place[j] >= 0 else u[-1 - place[j]]
-            near += (z * inverse[j] - scaled[i, j]) ** 2
-        near = np.exp(-0.5 * near)
+        near = _nearness(x, u, place, scaled[i], inverse)
         for j in range(place.size):
             if place[j] >= 0:
                 fall = -(x[place[j]] * inverse[j] - scaled[i, j]) * inverse[j] * near * dt
@@ -211,11 +216,7 @@ def process_share(x, u, place, data):
     n = scaled.shape[0]
     near = np.empty(n)
     for i in range(n):
-        total = 0.0
-        for j in range(place.size):
-            z = x[place[j]] if place[j] >= 0 else u[-1 - place[j]]
-            total += (z * inverse[j] - scaled[i, j]) ** 2
-        near[i] = np.exp(-0.5 * total)
+        near[i] = _nearness(x, u, place, scaled[i], inverse)
     left = 1.0
     for i in range(n):
         part = 0.0
@@ -229,8 +230,7 @@ def _standard(x, u, place, data, z):
     """z = the standardised features; returns D."""
     centre, scale, precision = data[0], data[1], data[2]
     for j in range(place.size):
-        value = x[place[j]] if place[j] >= 0 else u[-1 - place[j]] + 0.0 * x[0]
-        z[j] = (value - centre[j]) / scale[j]
+        z[j] = (_feature(x, u, place[j]) - centre[j]) / scale[j]
     square = 0.0 * x[0]
     for i in range(z.size):
         for j in range(z.size):
