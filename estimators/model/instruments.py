@@ -76,19 +76,19 @@ def with_instruments(model: StateSpaceModel, instruments: Mapping[str, Instrumen
     return replace(
         model,
         parameters=(*model.parameters, *added),
-        f=_driven_step(model.f, k, driven),
-        F=model.F and _driven_step(model.F, k, driven),
-        Q=model.Q and _driven_noise(model.Q, k, driven),
+        f=_driven(model.f, k, driven),
+        F=model.F and _driven(model.F, k, driven),
+        Q=model.Q and _driven(model.Q, k, driven),
         sensors=tuple(
             replace(
                 sensor,
                 h=_driven_sensor(sensor.h, k, driven, places.get(sensor.name, ())),
-                H=sensor.H and _driven_sensor(sensor.H, k, driven, ()) if sensor.name not in places else None,
+                H=sensor.H and _driven(sensor.H, k, driven) if sensor.name not in places else None,
                 log_likelihood=sensor.log_likelihood and _driven_likelihood(sensor.log_likelihood, k, driven),
             )
             for sensor in model.sensors
         ),
-        jump=model.jump and replace(model.jump, chances=_driven_step(model.jump.chances, k, driven)),
+        jump=model.jump and replace(model.jump, chances=_driven(model.jump.chances, k, driven)),
     )
 
 
@@ -102,51 +102,28 @@ def _drive(driven, u, p, v):
             v[j] += p[offset]
 
 
-@lru_cache(maxsize=64)
-def _driven_step(function: Callable, k: int, driven: tuple) -> Callable:
+@lru_cache(maxsize=256)
+def _driven(function: Callable, k: int, driven: tuple) -> Callable:
+    """Return f, F, Q, h, H or the chances of a jump, (x, u, p, ...), of the inputs as they drive the model."""
     inner = as_inner(function)
 
-    def same(x, u, p, dt, out):  # noqa: ANN001, ANN202
-        inner(x, u, p[:k], dt, out)
+    def same(x, u, p, *rest):  # noqa: ANN001, ANN002, ANN202
+        inner(x, u, p[:k], *rest)
 
-    def f(x, u, p, dt, out):  # noqa: ANN001, ANN202
+    def moved(x, u, p, *rest):  # noqa: ANN001, ANN002, ANN202
         v = stack_vector(p[0], driven)
         _drive(driven, u, p, v)
-        inner(x, v, p[:k], dt, out)
+        inner(x, v, p[:k], *rest)
 
-    return f if driven else same
-
-
-@lru_cache(maxsize=64)
-def _driven_noise(function: Callable, k: int, driven: tuple) -> Callable:
-    inner = as_inner(function)
-
-    def same(x, u, p, q, dt, out):  # noqa: ANN001, ANN202
-        inner(x, u, p[:k], q, dt, out)
-
-    def Q(x, u, p, q, dt, out):  # noqa: ANN001, ANN202
-        v = stack_vector(p[0], driven)
-        _drive(driven, u, p, v)
-        inner(x, v, p[:k], q, dt, out)
-
-    return Q if driven else same
+    return moved if driven else same
 
 
 @lru_cache(maxsize=256)
 def _driven_sensor(function: Callable, k: int, driven: tuple, read: tuple) -> Callable:
-    inner = as_inner(function)
-
-    def same(x, u, p, out):  # noqa: ANN001, ANN202
-        inner(x, u, p[:k], out)
-
-    def h(x, u, p, out):  # noqa: ANN001, ANN202
-        v = stack_vector(p[0], driven)
-        _drive(driven, u, p, v)
-        inner(x, v, p[:k], out)
-
+    h = _driven(function, k, driven)
     if not read:
-        return h if driven else same
-    within = as_inner(h if driven else same)
+        return h
+    within = as_inner(h)
 
     def instrument(x, u, p, out):  # noqa: ANN001, ANN202
         within(x, u, p, out)
