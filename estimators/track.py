@@ -101,6 +101,16 @@ def estimated_rows(track: Track, first: int = 0) -> np.ndarray:
     return np.asarray(np.isfinite(np.einsum("ij->i", track.mean[first:]) + np.einsum("ij->i", track.std[first:])))
 
 
+def covariances(std: np.ndarray, cross: np.ndarray) -> np.ndarray:
+    """Return covariances (N, n, n) of deviations (N, n), and the covariances of all pairs i < j in their order."""
+    n = std.shape[1]
+    cov = np.empty((len(std), n, n))
+    cov[:, range(n), range(n)] = std**2
+    i, j = np.triu_indices(n, 1)
+    cov[:, i, j] = cov[:, j, i] = cross
+    return cov
+
+
 # As in log.py: `len` counts rows, not columns.
 Track._make = classmethod(lambda cls, columns: cls(*columns))  # type: ignore[method-assign, assignment]
 

@@ -37,7 +37,7 @@ from ..log import Events, Log
 from ..model.state_space import StateSpaceModel
 from ..registry import checked, find_estimator
 from ..smoothing.smooth import check_smooth, smooth
-from ..track import Track
+from ..track import Track, covariances
 from ..tuning import Tuning
 from .table import table_of
 
@@ -338,12 +338,7 @@ class Estimates:
         """
         if not self.covariance:
             raise EstimatorError(NO_COVARIANCES)
-        n = self.track.std.shape[1]
-        cov = np.empty((len(self), n, n))
-        cov[:, range(n), range(n)] = self.track.std**2
-        i, j = np.triu_indices(n, 1)
-        cov[:, i, j] = cov[:, j, i] = self.track.cross
-        return cov
+        return covariances(self.track.std, self.track.cross)
 
     @property
     def log_likelihood(self) -> float:

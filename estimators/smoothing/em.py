@@ -40,7 +40,7 @@ from ..log import INPUT, READING, RESET, Log
 from ..model.state_space import StateSpaceModel
 from ..numerics.jit import jit
 from ..numerics.linalg import root, wrap
-from ..track import USED
+from ..track import USED, covariances
 from ..tuning import Tuning
 from .moments_back import MomentsBack
 from .notes import solve_semidefinite
@@ -182,10 +182,7 @@ def _round(fold: Fold) -> tuple[np.ndarray, np.ndarray]:
     out = Smoothed.room_for(fold)
     assert fold.estimator.smoothing is not None
     Walk(fold, MomentsBack(fold, fold.estimator.smoothing, out, lag)).back()
-    cov = np.empty((fold.n, n, n))
-    cov[:, range(n), range(n)] = out.std**2
-    i, j = np.triu_indices(n, 1)
-    cov[:, i, j] = cov[:, j, i] = out.cross
+    cov = covariances(out.std, out.cross)
     rows = slice(0, fold.n)
     over_q, over_r = np.zeros((2, len(model.noises))), np.zeros((2, fold.tuning.r.size))
     u = model.default_inputs.copy()
@@ -204,8 +201,8 @@ def shapes(context, x, u, dt, S, scratch):
     q = process_variances(context)
     kept = q.copy()
     for j in range(q.size):
-        for k in range(q.size):
-            q[k] = 1.0 if k == j else 0.0
+        q[:] = 0.0
+        q[j] = 1.0
         S[j] = 0.0
         add_process_noise(context, x, u, dt, S[j], scratch)
     for k in range(q.size):
