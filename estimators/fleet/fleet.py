@@ -137,6 +137,7 @@ class Fleet:
         self._shared, self._start = given[0], start
         self._allocate(None if start is None else int(arrays.nanoseconds("start", start)[0]))
         self._plan = self._planned(threads)
+        self._point()
         self._added: list[tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]] = []
 
     def _machine(self, tuning: Tuning, prior: Moments | None = None) -> Machine:
@@ -224,7 +225,7 @@ class Fleet:
         return self._part(self._block.head).view(np.int64)
 
     def _planned(self, threads: int | None) -> np.ndarray:
-        """Make the plan of the compiled call, except for its events."""
+        """Make the plan of the compiled call, except for its events and what `_point` writes."""
         model, machine, policy = self.model, self._machines[SHARED], self.policy
         most = int(numba.config.NUMBA_NUM_THREADS) if threaded() else 1
         self.threads = min(most, threads or most)
@@ -244,10 +245,7 @@ class Fleet:
         plan = np.zeros(1, PLAN)
         values: dict[str, Any] = {
             **self._sizes, **policy._asdict(), **code._asdict(),
-            "memory": self._memory.ctypes.data, "tunings": self._tuning_of.ctypes.data,
-            "contexts": self._contexts.ctypes.data, "rules": self._rules.ctypes.data,
             "crews": self.threads, "crew_places": self._crew_places.ctypes.data,
-            "records": 0 if gates is None else gates.places.ctypes.data,
             "free": 0 if gates is None else gates.free.ctypes.data,
             "record_slots": record_slots, "record_rows": record_rows, "nx": len(model.shown), "nu": nu, "state": state,
             "evidence": evidence, "edge": edge, "sensors": sensors, "rows": len(model.row_names), "ny": model.ny,
@@ -403,13 +401,15 @@ class Fleet:
 
     def _point(self) -> None:
         """Write the addresses of arrays that may have moved into the plan."""
-        for name, column in (
-            ("memory", self._memory), ("tunings", self._tuning_of), ("contexts", self._contexts),
-            ("rules", self._rules),
-        ):  # fmt: skip
-            self._plan[name] = column.ctypes.data
+        self._address(
+            memory=self._memory, tunings=self._tuning_of, contexts=self._contexts, rules=self._rules
+        )  # fmt: skip
         if self._gates is not None:
-            self._plan["records"] = self._gates.places.ctypes.data
+            self._address(records=self._gates.places)
+
+    def _address(self, **columns: np.ndarray) -> None:
+        for name, column in columns.items():
+            self._plan[name] = column.ctypes.data
 
     def add_ticks(self, seconds: Any, asset: Any = None) -> None:
         """Add queries, of all assets by default: the estimate and health of silent assets become those of that time."""
@@ -447,18 +447,12 @@ class Fleet:
         order, spare, visited, starts = numbers
         scratch_of_assets = np.empty(len(self.assets), np.int64)
         found = arrange(asset, t, place, value, scratch_of_assets, order, spare, visited, starts)
-        given = {"order": order, "t": t, "place": place, "value": value}
-        for name, column in given.items():
-            self._plan[name] = column.ctypes.data
+        self._address(order=order, t=t, place=place, value=value)
         self._plan["events"] = t.size
         visited, begins, ends = visited[:found], starts[:found].copy(), starts[1 : found + 1].copy()
         while visited.size:
             unfinished, asked = np.ones(visited.size, np.int8), np.zeros(visited.size, np.int8)
-            given = {
-                "visited": visited, "begins": begins, "ends": ends, "unfinished": unfinished, "asked": asked
-            }  # fmt: skip
-            for name, column in given.items():
-                self._plan[name] = column.ctypes.data
+            self._address(visited=visited, begins=begins, ends=ends, unfinished=unfinished, asked=asked)
             self._plan["count"] = visited.size
             if self._gates is not None:
                 self._gates.refill()

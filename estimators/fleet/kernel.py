@@ -11,7 +11,7 @@ import numpy as np
 from llvmlite import ir
 from numba import from_dtype, prange, types
 from numba.core import cgutils
-from numba.extending import intrinsic
+from numba.extending import intrinsic, register_jitable
 
 from ..compiled.context import _FIELDS as CONTEXT_FIELDS
 from ..compiled.context import context_at
@@ -21,8 +21,25 @@ from ..estimator import Code, call_start
 from ..fold_kernel import fold_event
 from ..gate.rejection_runs import Rule
 from ..log import _ORDER
-from ..numerics.jit import borrowed, counts, embedded, flag_rows, flags, floats, i64, ints, jit, masks, matrix, part
-from ..track import WHITENED, Track
+from ..numerics.jit import (
+    B1,
+    F1,
+    F2,
+    I1,
+    borrowed,
+    counts,
+    embedded,
+    flag_rows,
+    flags,
+    floats,
+    i64,
+    ints,
+    jit,
+    masks,
+    matrix,
+    part,
+)
+from ..track import WHITENED, Track, track_type
 from .memory import (
     AGE,
     ASKED,
@@ -88,32 +105,22 @@ def _plan_at(typing_context, place):
     return _plan_type(i64), codegen
 
 
-@embedded
-def _track_at(own, rows, nx, ny, width):
-    """Return the track of a thread."""
-    return Track(
-        matrix(floats(own[0], rows * nx), 0, rows, nx),
-        matrix(floats(own[1], rows * nx), 0, rows, nx),
-        matrix(floats(own[2], 0), 0, rows, 0),
-        matrix(floats(own[3], rows * ny), 0, rows, ny),
-        matrix(floats(own[4], rows * ny), 0, rows, ny),
-        floats(own[5], rows),
-        floats(own[6], rows),
-        counts(own[7], rows),
-        flags(own[8], rows),
-        floats(own[9], rows),
-        floats(own[10], rows),
-        floats(own[11], rows),
-        floats(own[12], rows),
-        flags(own[13], rows),
-        flags(own[14], rows),
-        matrix(floats(own[15], rows * ny), 0, rows, ny),
-        masks(own[16], rows, width),
-        ints(own[17], rows),
-        flag_rows(own[18], rows, ny),
-        floats(own[19], rows),
-        floats(own[20], rows),
-    )
+_TAKE = {
+    F1: "floats(own[{}], rows)",
+    I1: "ints(own[{}], rows)",
+    B1: "flags(own[{}], rows)",
+    types.int32[::1]: "counts(own[{}], rows)",
+    F2: "matrix(floats(own[{}], 0), 0, rows, {})",
+    types.Array(types.int32, 2, "C"): "masks(own[{}], rows, {})",
+    types.Array(types.int8, 2, "C"): "flag_rows(own[{}], rows, {})",
+}
+_widths = iter("nx nx 0 ny ny ny width ny".split())
+_columns = ", ".join(
+    _TAKE[kind].format(k, next(_widths) if kind.ndim == 2 else "") for k, kind in enumerate(track_type.types)
+)
+_named = {item.__name__: item for item in (Track, counts, flag_rows, flags, floats, ints, masks, matrix)}
+_track_at = register_jitable(eval(f"lambda own, rows, nx, ny, width: Track({_columns})", _named))
+"""Return the track of a thread, whose columns are at the addresses `own`."""
 
 
 @intrinsic
