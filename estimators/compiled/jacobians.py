@@ -41,33 +41,19 @@ _CENTRAL_STEP = 6e-6  # about the cube root of the rounding error, where truncat
 
 
 @linkable
-def complex_step_f(target, x, u, p, dt, J, scratch):
-    """Fill J (nx, nx) with df/dx of the complex function at address `target`."""
-    n = x.size
-    z = complexes(scratch, 0, n)
-    out = complexes(scratch, 2 * n, n)
-    for i in range(n):
-        z[i] = x[i]
-    for j in range(n):
-        z[j] = complex(x[j], _COMPLEX_STEP)
-        call_f_complex(target, z, u, p, dt, out)
-        z[j] = x[j]
-        for i in range(n):
-            J[i, j] = out[i].imag / _COMPLEX_STEP
-
-
-@linkable
-def complex_step_h(target, x, u, p, J, scratch):
-    """Fill J (ny, nx) with dh/dx of the complex function at address `target`."""
-    n = x.size
-    m = J.shape[0]
+def complex_step(target, of_sensor, x, u, p, dt, J, scratch):
+    """Fill J (m, nx) with df/dx, or of a sensor dh/dx, of the complex function at address `target`."""
+    m, n = J.shape
     z = complexes(scratch, 0, n)
     out = complexes(scratch, 2 * n, m)
     for i in range(n):
         z[i] = x[i]
     for j in range(n):
         z[j] = complex(x[j], _COMPLEX_STEP)
-        call_h_complex(target, z, u, p, out)
+        if of_sensor:
+            call_h_complex(target, z, u, p, out)
+        else:
+            call_f_complex(target, z, u, p, dt, out)
         z[j] = x[j]
         for i in range(m):
             J[i, j] = out[i].imag / _COMPLEX_STEP
@@ -90,7 +76,7 @@ def constant_rows(
     for k in np.flatnonzero(mode == COMPLEX_STEP).tolist():
         J = np.empty((rows[k], nx))
         scratch = np.empty(scratch_size(nx, rows[k]))
-        complex_step_h(static["h_complex"][k], static["prior_mean"], np.empty(0), p, J, scratch)
+        complex_step(static["h_complex"][k], True, static["prior_mean"], np.empty(0), p, 0.0, J, scratch)
         H[k], mode[k] = J.ctypes.data, CONSTANT
         made.append(J)
     return H, mode, made
@@ -137,7 +123,7 @@ def state_jacobian(context, x, u, dt, F, scratch):
     if context.F_mode == ANALYTIC:
         call_F(context.F, x, u, parameters(context), dt, F)
     elif context.F_mode == COMPLEX_STEP:
-        complex_step_f(context.f_complex, x, u, parameters(context), dt, F, scratch)
+        complex_step(context.f_complex, False, x, u, parameters(context), dt, F, scratch)
     else:
         _central(context, -1, x, u, dt, F, scratch)
 
@@ -155,6 +141,6 @@ def sensor_jacobian(context, sensor, x, u, H, scratch):
                 H[i, j] = constant[i * H.shape[1] + j]
     elif mode == COMPLEX_STEP:
         target = ints(context.h_complex, context.n_sensors)[sensor]
-        complex_step_h(target, x, u, parameters(context), H, scratch)
+        complex_step(target, True, x, u, parameters(context), 0.0, H, scratch)
     else:
         _central(context, sensor, x, u, 0.0, H, scratch)

@@ -17,7 +17,7 @@ from numba import types
 from ..errors import ModelError
 from ..model.check import check_parts, probe, probe_angles, probe_likelihoods
 from ..model.state_space import LARGE, Field, StateSpaceModel
-from ..model.wrapping import is_derived
+from ..model.wrapping import is_derived, noise_function
 from ..numerics.helpers import with_helpers
 from ..numerics.jit import address, jit, plain
 from .black_box import ANSWER, BlackBox, answered_f, answered_h
@@ -36,7 +36,7 @@ from .context import (
     looped_h,
     shape_signature,
 )
-from .jacobians import ANALYTIC, CENTRAL, COMPLEX_STEP, complex_step_f, complex_step_h, scratch_size
+from .jacobians import ANALYTIC, CENTRAL, COMPLEX_STEP, complex_step, scratch_size
 from .model_code import ModelCode, SharedCode, call_h, call_h_block
 
 
@@ -99,7 +99,7 @@ def _compile(model: StateSpaceModel) -> CompiledModel:
     f = made.address(looped_f(f_one, *sizes), f_rows_signature)
     F = made.over_complex(model.F, F_signature) if is_derived(model.F) else made.of(model.F, F_signature, "F")
     diagonal = model.shape is not None or model.nx > LARGE
-    model_Q = _each_cell if isinstance(model.states, Field) and not model.Q and not diagonal else model.Q
+    model_Q = noise_function(model) if isinstance(model.states, Field) and not diagonal else model.Q
     Q_dispatcher = made.compiled(model_Q, Q_signature, "Q") if model_Q else None
     shape_dispatcher = made.compiled(model.shape, shape_signature, "shape") if model.shape else None
     derivable = model.nx <= LARGE and box is None
@@ -255,12 +255,6 @@ def _within(states: range, w: np.ndarray) -> np.ndarray:
     return out
 
 
-def _each_cell(x, u, p, q, dt, out):
-    """Fill Q of a field with the same noise in every cell."""
-    for j in range(x.size):
-        out[j, j] = q[0] * dt
-
-
 def _varies(model: StateSpaceModel) -> bool:
     """Return whether Q depends on the state, from its values at the prior and at 32 states around it."""
     if model.Q is None:
@@ -324,7 +318,9 @@ def _check_derivatives(compiled: CompiledModel) -> None:
         elif error > tolerance:
             raise ModelError(f"model {model.name}: F differs from central differences of f by {error:.2g} (relative)")
     elif static["F_mode"] == COMPLEX_STEP:
-        if disagree(lambda x, J: complex_step_f(static["f_complex"], x, u, p, dt, J, scratch), f, model.nx) > tolerance:
+        target = static["f_complex"]
+        error = disagree(lambda x, J: complex_step(target, False, x, u, p, dt, J, scratch), f, model.nx)
+        if error > tolerance:
             static["F_mode"] = CENTRAL
     for k, sensor in enumerate(model.sensors):
 
@@ -344,5 +340,5 @@ def _check_derivatives(compiled: CompiledModel) -> None:
                 )
         elif mode == COMPLEX_STEP:
             target = int(static["h_complex"][k])
-            if disagree(lambda x, J, a=target: complex_step_h(a, x, u, p, J, scratch), h, rows) > tolerance:
+            if disagree(lambda x, J, a=target: complex_step(a, True, x, u, p, dt, J, scratch), h, rows) > tolerance:
                 static["H_mode"][k] = CENTRAL

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from estimators.compiled.jacobians import ANALYTIC, CENTRAL, COMPLEX_STEP, complex_step_f, complex_step_h, scratch_size
+from estimators.compiled.jacobians import ANALYTIC, CENTRAL, COMPLEX_STEP, complex_step, scratch_size
 from estimators.compiled.model import compile_model
 from estimators.fold import fold
 from estimators.log import READING, Log
@@ -94,12 +94,12 @@ def test_complex_step_is_exact(seed):
     x = np.array([rng.normal(), rng.normal(), rng.uniform(0.5, 3)])
     scratch = np.empty(scratch_size(3, 2))
     J, expected = np.empty((3, 3)), np.empty((3, 3))
-    complex_step_f(static["f_complex"], x, U, P, 0.37, J, scratch)
+    complex_step(static["f_complex"], False, x, U, P, 0.37, J, scratch)
     F(x, U, P, 0.37, expected)
     # No difference is taken, so no digit is lost: a few roundings of each elementary function.
     np.testing.assert_allclose(J, expected, rtol=1e-13, atol=1e-14)
     J, expected = np.empty((2, 3)), np.empty((2, 3))
-    complex_step_h(static["h_complex"][0], x, U, P, J, scratch)
+    complex_step(static["h_complex"][0], True, x, U, P, 0.0, J, scratch)
     H(x, U, P, expected)
     np.testing.assert_allclose(J, expected, rtol=1e-13, atol=1e-14)
 
@@ -198,7 +198,7 @@ def test_a_derivative_that_divides_by_zero_ends_no_fold():
     )  # fmt: skip
     H = np.zeros((1, 2))
     target = compile_model(model).static["h_complex"][0]
-    complex_step_h(target, np.array([1.0, 0.0]), np.empty(0), np.empty(0), H, np.empty(scratch_size(2, 1)))
+    complex_step(target, True, np.array([1.0, 0.0]), np.empty(0), np.empty(0), 0.0, H, np.empty(scratch_size(2, 1)))
     assert np.isnan(H[0, 0])
     log = Log.of(model, start=0.0)
     log.add("share", [1.0, 2.0], [0.5, 0.5])
