@@ -15,6 +15,9 @@ start or end of an injected fault; maintenance, which resets the covariance of a
 
 BEFORE = -(2**62)  # Earlier than any event, and far enough from the end of int64 to subtract a horizon
 
+COLUMN_TYPES = {"t": np.int64, "arrival": np.int64, "kind": np.int8, "channel": np.int32}
+"""Types of the first columns of `Events`; the last holds float64s."""
+
 KIND_NAMES = ("reading", "input", "truth", "tick", "reset", "mark", "maintenance")
 
 
@@ -40,8 +43,7 @@ class Events(NamedTuple):
     @staticmethod
     def empty(width: int) -> Events:
         """Return a batch without events."""
-        none = np.zeros(0, np.int64)
-        return Events(none, none, np.zeros(0, np.int8), np.zeros(0, np.int32), np.zeros((0, width)))
+        return Events._make([*(np.zeros(0, kind) for kind in COLUMN_TYPES.values()), np.zeros((0, width))])
 
     @staticmethod
     def one(t: int, arrival: int, kind: int, channel: int, values: object, width: int) -> Events:
@@ -55,13 +57,8 @@ class Events(NamedTuple):
         if given.size > width:
             raise EventError(f"values are {given.size}; they must be {width} at most, the width of the log")
         row[0, : given.size] = given
-        return Events(
-            np.array([_whole("t", t)], np.int64),
-            np.array([_whole("arrival", arrival)], np.int64),
-            np.array([_whole("kind", kind)], np.int8),
-            np.array([_whole("channel", channel)], np.int32),
-            row,
-        )
+        numbers = zip(COLUMN_TYPES.items(), (t, arrival, kind, channel), strict=True)
+        return Events._make([*(np.array([_whole(name, number)], wanted) for (name, wanted), number in numbers), row])
 
     @staticmethod
     def concat(batches: list[Events], width: int) -> Events:

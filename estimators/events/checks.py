@@ -15,7 +15,7 @@ from numba import types
 from ..errors import LARGEST, EventError
 from ..model.state_space import EventLayout
 from ..numerics.jit import i64, jit_brief
-from .batch import BEFORE, INPUT, KIND_NAMES, MAINTENANCE, MARK, READING, TRUTH, Events
+from .batch import BEFORE, COLUMN_TYPES, INPUT, KIND_NAMES, MAINTENANCE, MARK, READING, TRUTH, Events
 
 FINE, TIME, KIND, CHANNEL, VALUES, STRAY, VARIANCE = range(7)  # Rules, by which `_look` names a violation
 _ANY = np.zeros(0, np.int64)  # Rows of the sensors of an unknown model
@@ -93,9 +93,6 @@ def _looking() -> Any:
     return _look
 
 
-_TYPES = {"t": np.int64, "arrival": np.int64, "kind": np.int8, "channel": np.int32}
-
-
 def admitted(batch: Events, width: int, layout: EventLayout | None) -> Events:
     """Return the batch, with infinite values replaced by NaN, if a log accepts it.
 
@@ -129,7 +126,7 @@ def _plain(batch: Events) -> Events:
     """
     n = batch.t.size
     columns = [*batch]
-    for j, (name, wanted) in enumerate(_TYPES.items()):
+    for j, (name, wanted) in enumerate(COLUMN_TYPES.items()):
         column = columns[j]
         if column.shape != (n,):
             raise EventError(f"{name} has shape {column.shape}; it must be ({n},), one for each event")

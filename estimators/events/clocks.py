@@ -38,7 +38,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from .batch import BEFORE, INPUT, READING, TRUTH, Events
+from .batch import BEFORE, COLUMN_TYPES, INPUT, READING, TRUTH, Events
 from .clock_expected import (
     AHEAD,
     ARRIVED,
@@ -460,11 +460,10 @@ def nearest_zone(step: int) -> int:
 
 def plain_events(batch: Events) -> Events:
     """Return the batch with columns of the types that the compiled functions read; itself if it has them."""
-    types_ = (np.int64, np.int64, np.int8, np.int32)
-    columns = [np.ascontiguousarray(column, kind) for column, kind in zip(batch[:4], types_, strict=True)]
+    columns = [np.ascontiguousarray(column, kind) for column, kind in zip(batch, COLUMN_TYPES.values(), strict=False)]
     if all(a is b for a, b in zip(columns, batch, strict=False)):
         return batch
-    return Events(columns[0], columns[1], columns[2], columns[3], batch.value)
+    return Events._make([*columns, batch.value])
 
 
 class HeldRun:
