@@ -266,10 +266,6 @@ class Objective:
         self.recent[x.tobytes()] = found
         return found
 
-    def gradient(self, x: np.ndarray) -> tuple[float, np.ndarray]:
-        """Return the objective and its gradient (k,)."""
-        return self.slope_and_scores(x)[:2]
-
     def slope_and_scores(self, x: np.ndarray, here: np.ndarray | None = None) -> tuple[float, np.ndarray, np.ndarray]:
         """Return the objective, its gradient (k,), and the derivatives of its terms (k, n); `here` as `slopes`."""
         here, scores = self.slopes(x, here)
@@ -328,7 +324,7 @@ def scaled_rounds(objective: Objective, x: np.ndarray, *, rounds: int = MAX_ROUN
 
         def loss(z: np.ndarray, x: np.ndarray = x, unit: np.ndarray = unit) -> tuple[float, np.ndarray]:
             point = objective.within(x + unit * z)
-            found, gradient = objective.gradient(point)
+            found, gradient, _ = objective.slope_and_scores(point)
             best.add(point, found)
             return -found, -gradient * unit
 

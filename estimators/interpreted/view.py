@@ -179,9 +179,6 @@ def driven(entry: Estimator) -> Code:
         p[-ANSWER:] = X.ctypes.data, answers.ctypes.data
         return context
 
-    def start_driven(view: View, mean: np.ndarray, cov: np.ndarray, state: np.ndarray) -> None:
-        start(view.context, mean, cov, state)
-
     def predict_driven(view: View, u: np.ndarray, dt: float, index: int, state: np.ndarray, work: np.ndarray) -> None:
         X = members(view.options, state, view.nx)
         forward = view.f(X, u, dt)
@@ -201,7 +198,8 @@ def driven(entry: Estimator) -> Code:
         expected = view.h(sensor, X, u)
         return int(update(answering(view, X, expected), u, sensor, y, index, state, work, *rest))
 
-    def describe_driven(view: View, state: np.ndarray, mean: np.ndarray, std: np.ndarray, cross: np.ndarray) -> None:
-        describe(view.context, state, mean, std, cross)
+    def within(function: Any) -> Any:
+        """The function, called with a view."""
+        return lambda view, *given: function(view.context, *given)
 
-    return Code(start_driven, predict_driven, update_driven, describe_driven)
+    return Code(within(start), predict_driven, update_driven, within(describe))

@@ -31,11 +31,10 @@ def flow(x, u, p):
     return sigma * (x[1] - x[0]), x[0] * (rho - x[2]) - x[1], x[0] * x[1] - beta * x[2]
 
 
-def position(x, u, p, out):
-    """Measure all three states."""
-    out[0] = x[0]
-    out[1] = x[1]
-    out[2] = x[2]
+def stations(x, u, p, out):
+    """Measure every state."""
+    for i in range(x.size):
+        out[i] = x[i]
 
 
 LORENZ63 = StateSpaceModel(
@@ -61,7 +60,7 @@ LORENZ63 = StateSpaceModel(
         Sensor(
             "position",
             (Row("x", "1", variance=2.0), Row("y", "1", variance=2.0), Row("z", "1", variance=2.0)),
-            h=position,
+            h=stations,
         ),
     ),
     f=rk4(flow),
@@ -80,12 +79,6 @@ def advection(x, u, p, out):
         out[i] = (x[i + 1] - x[i - 2]) * x[i - 1] - x[i] + p[0]
     for i in (0, 1, n - 1):
         out[i] = (x[(i + 1) % n] - x[(i - 2) % n]) * x[(i - 1) % n] - x[i] + p[0]
-
-
-def stations(x, u, p, out):
-    """Measure every state."""
-    for i in range(x.size):
-        out[i] = x[i]
 
 
 LORENZ96 = StateSpaceModel(
