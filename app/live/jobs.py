@@ -300,12 +300,15 @@ def run_all(*works: Callable[[], Any]) -> None:
 def start_in_thread(work: Callable[[], Any], name: str) -> Future[Any]:
     """Call a function in a daemon thread of its own; the future has its result or error."""
     outcome: Future[Any] = Future()
-
-    def run() -> None:
-        try:
-            outcome.set_result(work())
-        except BaseException as error:  # noqa: BLE001  raised again by the future
-            outcome.set_exception(error)
-
-    threading.Thread(target=run, name=name, daemon=True).start()
+    threading.Thread(target=carry_out, args=(outcome, work), name=name, daemon=True).start()
     return outcome
+
+
+def carry_out(outcome: Future[Any], work: Callable[[], Any]) -> None:
+    """Call a function, and put its result or error into a future that is not cancelled."""
+    if not outcome.set_running_or_notify_cancel():
+        return
+    try:
+        outcome.set_result(work())
+    except BaseException as error:  # noqa: BLE001  raised again by the future
+        outcome.set_exception(error)

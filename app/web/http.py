@@ -9,10 +9,8 @@ import inspect
 import json
 import math
 import re
-import threading
 import typing
 from collections.abc import Awaitable, Callable, Iterable, Mapping
-from concurrent.futures import Future
 from functools import cache
 from importlib.metadata import version
 from pathlib import Path
@@ -25,6 +23,7 @@ from starlette.routing import BaseRoute, Route
 
 from estimators.errors import ConfigError, NisusError, nearest, printable, quoted, shown_name
 
+from ..live.jobs import start_in_thread
 from .request_threads import in_thread
 
 T = TypeVar("T")
@@ -241,18 +240,8 @@ class OneAtATime:
             await asyncio.wait_for(self._lock.acquire(), QUEUE_TIMEOUT_S)
         except TimeoutError:
             raise ConfigError(f"{self._subject}: another one is under way; ask again") from None
-        outcome: Future[T] = Future()
-        outcome.set_running_or_notify_cancel()
-
-        def run() -> None:
-            try:
-                outcome.set_result(work())
-            except Exception as error:  # noqa: BLE001  passed on to the request
-                outcome.set_exception(error)
-
-        threading.Thread(target=run, name=self._subject, daemon=True).start()
         try:
-            return await asyncio.wrap_future(outcome)
+            return await asyncio.wrap_future(start_in_thread(work, self._subject))
         finally:
             self._lock.release()
 

@@ -11,6 +11,8 @@ from functools import partial
 from queue import SimpleQueue
 from typing import Any, TypeVar
 
+from ..live.jobs import carry_out
+
 T = TypeVar("T")
 
 REQUEST_THREADS = 12
@@ -55,16 +57,7 @@ class RequestThreads:
 
     def _serve(self) -> None:
         while True:
-            self._carry_out(*self._queue.get())
-
-    @staticmethod
-    def _carry_out(outcome: Future[Any], work: Callable[[], Any]) -> None:
-        if not outcome.set_running_or_notify_cancel():
-            return
-        try:
-            outcome.set_result(work())
-        except BaseException as error:  # noqa: BLE001  passed on to the request
-            outcome.set_exception(error)
+            carry_out(*self._queue.get())
 
 
 in_thread = RequestThreads("request", REQUEST_THREADS).run
