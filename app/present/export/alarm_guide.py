@@ -1,55 +1,28 @@
-"""The few forms of Markdown that our own texts use, as HTML: headings with anchors, paragraphs, lists, tables."""
+"""The guide to alarms, as a page of HTML and as answers on one cause."""
 
 from __future__ import annotations
 
 import re
 import sysconfig
 from functools import cache
-from html import escape
+from itertools import pairwise
 from pathlib import Path
 
 from estimators.diagnostics.detectors import anchor
 from estimators.errors import ConfigError
 
-BLOCK = re.compile(r"\n\s*\n")
-
 
 def as_html(text: str) -> str:
     """Headings have the anchors that GitHub makes of them."""
-    return "\n".join(_block(block) for block in BLOCK.split(text.strip()) if block.strip())
+    from markdown_it import MarkdownIt
 
-
-def _block(block: str) -> str:
-    lines = block.splitlines()
-    heading = re.fullmatch(r"(#+) (.+)", lines[0])
-    if heading:
-        level, title = len(heading[1]), heading[2]
-        name = re.sub(r"[^\w -]", "", anchor(title.lower()))
-        rest = "\n".join(lines[1:])
-        return f'<h{level} id="{escape(name)}">{_words(title)}</h{level}>' + (f"\n{_block(rest)}" if rest else "")
-    if lines[0].startswith("- "):
-        items = re.split(r"^- ", block, flags=re.MULTILINE)[1:]
-        return "<ul>\n" + "\n".join(f"<li>{_words(item)}</li>" for item in items) + "\n</ul>"
-    if lines[0].startswith("|"):
-        head, _, *rows = [[cell.strip() for cell in line.strip().strip("|").split("|")] for line in lines]
-        return f"<table>\n{_row('th', head)}\n" + "\n".join(_row("td", row) for row in rows) + "\n</table>"
-    return f"<p>{_words(block)}</p>"
-
-
-def _row(tag: str, cells: list[str]) -> str:
-    return "<tr>" + "".join(f"<{tag}>{_words(cell)}</{tag}>" for cell in cells) + "</tr>"
-
-
-def _words(text: str) -> str:
-    """Render code, bold and emphasis within a line; code stays as it is."""
-    parts = re.split(r"`([^`]+)`", escape(" ".join(text.split()), quote=False))
-    for k, part in enumerate(parts):
-        if k % 2:
-            parts[k] = f"<code>{part}</code>"
-        else:
-            part = re.sub(r"\*\*(.+?)\*\*", r"<strong>\1</strong>", part)
-            parts[k] = re.sub(r"\*(.+?)\*", r"<em>\1</em>", part)
-    return "".join(parts)
+    # Links lead to other guides, which are not served.
+    markdown = MarkdownIt("commonmark", {"html": False}).enable("table").disable("link")
+    tokens = markdown.parse(text)
+    for heading, title in pairwise(tokens):
+        if heading.type == "heading_open":
+            heading.attrSet("id", re.sub(r"[^\w -]", "", anchor(title.content.lower())))
+    return str(markdown.renderer.render(tokens, markdown.options, {}))
 
 
 NAME = "docs/alarms.md"

@@ -9,12 +9,14 @@ from tests.app.cli.test_check import ParsedHtml
 
 def test_forms():
     text = (
-        "# A *b* & <c>\n\none\ntwo `x*y*` **z**\n\n- first\n  more\n- *second*\n\n| a | b |\n|---|---|\n| 1 | `2` |\n"
+        "# A *b* & <c>\n\none\ntwo `x*y*` **z** *n `m`* [l](m)\n\n- first\n  more\n- *second*\n\n"
+        "| a | b |\n|---|---|\n| 1 | `2` |\n"
     )
     assert as_html(text) == (
-        '<h1 id="a-b--c">A <em>b</em> &amp; &lt;c&gt;</h1>\n<p>one two <code>x*y*</code> <strong>z</strong></p>\n'
-        "<ul>\n<li>first more</li>\n<li><em>second</em></li>\n</ul>\n"
-        "<table>\n<tr><th>a</th><th>b</th></tr>\n<tr><td>1</td><td><code>2</code></td></tr>\n</table>"
+        '<h1 id="a-b--c">A <em>b</em> &amp; &lt;c&gt;</h1>\n<p>one\ntwo <code>x*y*</code> <strong>z</strong> '
+        "<em>n <code>m</code></em> [l](m)</p>\n<ul>\n<li>first\nmore</li>\n<li><em>second</em></li>\n</ul>\n"
+        "<table>\n<thead>\n<tr>\n<th>a</th>\n<th>b</th>\n</tr>\n</thead>\n"
+        "<tbody>\n<tr>\n<td>1</td>\n<td><code>2</code></td>\n</tr>\n</tbody>\n</table>\n"
     )
 
 
