@@ -190,7 +190,7 @@ class PageServer:
             routes += [
                 WebSocketRoute("/viser/{path:path}", self._viser.websocket),
                 WebSocketRoute("/viser", self._viser.websocket),
-                Route("/viser/{path:path}", self._viser.http),
+                Route("/viser/", self._viser.page),
             ]
         return routes
 

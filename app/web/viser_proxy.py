@@ -1,25 +1,24 @@
-"""Passes `/viser/...` through to the private Viser server, whose secret only this process knows."""
+"""Viser at `/viser/`: its client, and the WebSocket of the private server, whose secret only this process knows."""
 
 from __future__ import annotations
 
-import http.client
 from collections.abc import Mapping
 from contextlib import suppress
+from pathlib import Path
 from urllib.parse import quote, urlencode
 
+import viser
 import websockets
 from starlette.requests import Request
-from starlette.responses import PlainTextResponse, Response
+from starlette.responses import HTMLResponse, Response
 from starlette.websockets import WebSocket, WebSocketDisconnect
 from websockets.asyncio.client import ClientConnection, connect
 
 from ..views.viser.guarded_server import HEADER
 from .http import PAGE
-from .request_threads import in_thread
 from .streams import serve
 
-RESPONSE_HEADERS = ("content-type", "content-encoding", "etag", "last-modified", "cache-control")
-REQUEST_HEADERS = ("accept", "accept-encoding", "if-none-match")
+CLIENT = Path(viser.__file__).parent / "client" / "build" / "index.html"
 HTML_HEAD = b"<head>"
 SCRIPT = PAGE / "viser_frame.js"
 
@@ -44,34 +43,11 @@ class ViserProxy:
         self._port = port
         self._secret = secret
 
-    async def http(self, request: Request) -> Response:
-        """Fetch a file of Viser's client."""
-        path = "/" + quote(request.path_params["path"])
-        # The page uncompressed and not from a cache, as it is changed here.
-        asked = {} if path == "/" else dict(request.headers)
-        try:
-            status, headers, body = await in_thread(self._fetch, path, asked)
-        except (OSError, http.client.HTTPException) as error:
-            return PlainTextResponse(f"Nisus: the Viser pane does not answer ({error}).\n", 502)
-        if path == "/":
-            # In the text, as a frame under another name may fetch no more.
-            script = b"<script>" + SCRIPT.read_bytes() + b"</script>"
-            body = body.replace(HTML_HEAD, HTML_HEAD + script + SCENE_ALONE, 1)
-        answer = Response(body, status)
-        for name, value in headers:
-            if name.lower() in RESPONSE_HEADERS and not (path == "/" and name.lower() == "etag"):
-                answer.headers[name] = value
-        return answer
-
-    def _fetch(self, path: str, headers: dict[str, str]) -> tuple[int, list[tuple[str, str]], bytes]:
-        wanted = {name: value for name, value in headers.items() if name in REQUEST_HEADERS}
-        connection = http.client.HTTPConnection("127.0.0.1", self._port, timeout=30.0)
-        try:
-            connection.request("GET", path, headers=wanted | {HEADER: self._secret})
-            answer = connection.getresponse()
-            return answer.status, answer.getheaders(), answer.read()
-        finally:
-            connection.close()
+    async def page(self, request: Request) -> Response:
+        """Answer with Viser's client, which is one file."""
+        # In the text, as a frame under another name may fetch no more.
+        own = b"<script>" + SCRIPT.read_bytes() + b"</script>" + SCENE_ALONE
+        return HTMLResponse(CLIENT.read_bytes().replace(HTML_HEAD, HTML_HEAD + own, 1))
 
     async def websocket(self, browser: WebSocket) -> None:
         """Couple a browser's WebSocket with one of Viser's, until either closes."""

@@ -1,6 +1,5 @@
 """A page server over a scripted engine and a stand-in for Viser, and a client that sends exactly what it is told."""
 
-import http
 import http.client
 import io
 import json
@@ -8,8 +7,6 @@ import socket
 import threading
 from urllib.parse import parse_qs, urlsplit
 
-from websockets.datastructures import Headers
-from websockets.http11 import Response
 from websockets.sync.client import connect
 from websockets.sync.server import serve
 
@@ -25,7 +22,7 @@ SECRET = "the secret between the servers"
 
 
 class FakeViser:
-    """Answers a file request with what it saw of it, and echoes what comes over a WebSocket."""
+    """Echoes what comes over a WebSocket."""
 
     def __init__(self):
         self.requests = []
@@ -38,11 +35,6 @@ class FakeViser:
 
     def process(self, connection, request):
         self.requests.append((request.path, request.headers.get_all(HEADER)))
-        if "upgrade" in request.headers:
-            return None
-        body = json.dumps({"path": request.path, "secret": request.headers.get_all(HEADER)}).encode()
-        headers = Headers({"Content-Type": "application/json", "Content-Length": str(len(body)), "Connection": "close"})
-        return Response(http.HTTPStatus.OK.value, "OK", headers, body)
 
     def echo(self, connection):
         for message in connection:

@@ -306,12 +306,6 @@ def test_no_header_is_answered_by_a_failure_of_ours(page, name, value):
             assert not isinstance(error, InvalidStatus) or error.response.status_code < 500
 
 
-def test_viser_gets_the_path_as_it_was_asked(page):
-    for path in ("/caf%C3%A9%20b.js", "/a%3Fb"):
-        answer = page.client.get("/viser" + path)
-        assert answer.status == 200 and json.loads(answer.text)["path"] == path
-
-
 def test_status_is_strict_json_and_counts_whatever_was_asked(seekable):
     seekable.source.put(readings([3.0], [np.nan]))
     for command in ({"command": "SetTuning", "key": "gate", "value": None}, {"command": "Speed", "factor": "inf"}):

@@ -3,10 +3,12 @@
 import asyncio
 import json
 import socket
+from pathlib import Path
 from urllib.parse import quote
 
 import numpy as np
 import pytest
+import viser
 from rerun.chunk import RrdReader
 from websockets.sync.client import connect
 
@@ -172,9 +174,9 @@ def test_a_pass_opens_the_stage_without_a_cookie(page):
     here = f"localhost:{page.client.port}"
     with connect(
         f"ws://{here}/viser/?pass={given}&theme=light", origin=f"http://{here}", subprotocols=["viser-test"], proxy=None
-    ) as viser:
-        viser.send("text")
-        assert viser.recv(timeout=LIMIT_S) == "text"
+    ) as stage:
+        stage.send("text")
+        assert stage.recv(timeout=LIMIT_S) == "text"
     assert page.viser.requests and not any(given in str(request) for request in page.viser.requests)
 
 
@@ -276,24 +278,32 @@ def test_each_view_has_a_page_of_its_own(page):
     assert page.viser.requests[-1] == ("/?theme=dark", [SECRET])
 
 
-def test_viser_files_pass_without_prefix_and_with_the_secret(page):
-    answer = page.client.get("/viser/assets/a.js?v=1")
-    assert json.loads(answer.text)["path"].partition("?")[0] == "/assets/a.js"
-    assert json.loads(answer.text)["secret"] == [SECRET]
+def test_visers_client_is_its_own_file_with_a_script_and_a_style_of_ours_and_there_is_no_other(page):
+    answer = page.client.get("/viser/")
+    head, rest = Path(viser.__file__).with_name("client").joinpath("build/index.html").read_text().split("<head>", 1)
+    assert answer.headers["content-type"] == "text/html; charset=utf-8"
+    assert answer.text.startswith(f"{head}<head><script>") and answer.text.endswith(f"</style>{rest}")
+    assert page.client.get("/viser/assets/a.js?v=1").status == 404 and not page.viser.requests
 
 
 def test_a_secret_of_the_browser_is_not_passed_on(page):
     client = page.client
-    headers = [("Host", client.host), ("Cookie", client.cookie), ("X-Nisus-Secret", "guess")]
-    assert json.loads(client.raw("GET", "/viser/", headers).text)["secret"] == [SECRET]
+    headers = {"Cookie": client.cookie, "X-Nisus-Secret": "guess"}
+    with connect(
+        f"ws://{client.host}/viser/", origin=client.origin, additional_headers=headers, subprotocols=["viser-test"],
+        proxy=None,
+    ) as socket:  # fmt: skip
+        socket.send("hello")
+        assert socket.recv(timeout=LIMIT_S) == "hello"
+    assert page.viser.requests == [("/", [SECRET])]
 
 
 def test_viser_messages_pass_both_ways(page):
-    with page.connect("/viser/?a=b", subprotocols=["viser-test"]) as viser:
-        assert viser.subprotocol == "viser-test"
+    with page.connect("/viser/?a=b", subprotocols=["viser-test"]) as stage:
+        assert stage.subprotocol == "viser-test"
         for message in ("text", b"bytes"):
-            viser.send(message)
-            assert viser.recv(timeout=LIMIT_S) == message
+            stage.send(message)
+            assert stage.recv(timeout=LIMIT_S) == message
     assert page.viser.requests[-1] == ("/?a=b", [SECRET])
 
 
