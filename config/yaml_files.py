@@ -292,7 +292,8 @@ def with_section(text: str, key: str, section: str) -> str:
 def with_values(text: str, values: Mapping[Key, Any]) -> tuple[str, list[Key]]:
     """Return a YAML text with other values at some keys, and the keys that it does not have; comments stay.
 
-    A value that an alias shares with another key counts as one that it does not have.
+    A value that an alias shares with another key counts as one that it does not have. A mapping replaces any value, and
+    is the first entry of its section where that has no such key.
     """
     root = _composed(text)
     places = Counter(map(id, _nodes(root)))
@@ -300,20 +301,41 @@ def with_values(text: str, values: Mapping[Key, Any]) -> tuple[str, list[Key]]:
     missing: list[Key] = []
     for key, value in values.items():
         node, shared = root, False
+        name: Any = None
         for part in key:
+            section, head, name = node, name, None
             if isinstance(node, yaml.SequenceNode) and isinstance(part, int):
                 node = node.value[part]
             else:
                 items = node.value if isinstance(node, yaml.MappingNode) else ()
-                node = next((item for name, item in items if name.value == part), None)
+                name, node = next((item for item in items if item[0].value == part), (None, None))
             shared |= places[id(node)] > 1
-        if not shared and isinstance(node, yaml.SequenceNode if isinstance(value, list) else yaml.ScalarNode):
-            edits.append((node.start_mark.index, node.end_mark.index, as_flow(value)))
+        written = as_flow(value)
+        if shared:
+            missing.append(key)
+        elif isinstance(value, Mapping) and name is not None:
+            edits.append((name.end_mark.index, _end(node), f": {written}"))
+        elif isinstance(value, Mapping) and isinstance(section, yaml.MappingNode) and section.value and head:
+            first, line = section.value[0][0].start_mark, f"{_key(str(part))}: {written}"
+            if section.flow_style:
+                edits.append((first.index, first.index, f"{line}, "))
+            else:  # above the comments on the first entry
+                begin = text.index("\n", head.end_mark.index) + 1
+                edits.append((begin, begin, " " * first.column + line + "\n"))
+        elif isinstance(node, yaml.SequenceNode if isinstance(value, list) else yaml.ScalarNode):
+            edits.append((node.start_mark.index, node.end_mark.index, written))
         else:
             missing.append(key)
-    for begin, end, value in sorted(edits, reverse=True):
-        text = text[:begin] + value + text[end:]
+    for begin, end, written in sorted(edits, reverse=True):
+        text = text[:begin] + written + text[end:]
     return text, missing
+
+
+def _end(node: Any) -> int:
+    """Return the index after a node; PyYAML ends one in block style after the comments that follow."""
+    while isinstance(node, yaml.CollectionNode) and not node.flow_style:
+        node = node.value[-1][1] if isinstance(node, yaml.MappingNode) else node.value[-1]
+    return int(node.end_mark.index)
 
 
 def _nodes(node: Any) -> Iterator[Any]:

@@ -12,14 +12,13 @@ enough, at the end.
 
 from __future__ import annotations
 
-import re
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import dataclass, field
 from typing import Any
 
 from config.tunings import SPREADS
-from config.yaml_files import as_flow, parse, with_section
+from config.yaml_files import as_flow, as_section, parse, with_section, with_values
 from estimators.diagnostics.calibration import LIMITS
 from estimators.errors import ConfigError, NisusError
 from estimators.log import Log
@@ -300,43 +299,34 @@ def _word(advice: Advice, name: str, value: float) -> str:
 
 def lasting_lines(advice: Advice) -> str:
     """Return the entries of `noise` and `sensors` that declare coloured noise; empty if there is none."""
-    found: dict[str, list[str]] = {}
+    found: dict[str, dict[str, object]] = {}
     for key, entry in advice.sections.items():
         group, _, name = key.partition(".")
-        found.setdefault(group, []).append(f"  {name}: {as_flow(entry)}\n")
-    return "".join(f"{group}:\n{''.join(entries)}" for group, entries in found.items())
+        found.setdefault(group, {})[name] = entry
+    return "".join(f"{line}\n" for group, entries in found.items() for line in as_section(group, entries))
 
 
 def with_entry(text: str, key: str, entry: Mapping[str, Any]) -> str:
     """A YAML's text in which `GROUP.NAME` says this too; what else it said stays, its comments do not.
 
     Raises:
-        ConfigError: If the group is not written with a line for each of its names.
+        ConfigError: If an alias shares what it says with another key.
     """
     group, _, name = key.partition(".")
-    data = parse(text, "the YAML")[0][group] if re.search(rf"^{group}[ \t]*:", text, re.MULTILINE) else {}
-    own = (data or {}).get(name) or {}
+    known = parse(text, "the YAML")[0].get(group)
+    if not known:
+        return with_section(text, group, "".join(f"{line}\n" for line in as_section(group, {name: entry})))
+    own = known.get(name) or {}
     # Its white noise is another once part of it lasts.
     merged = {**{word: value for word, value in own.items() if word not in SPREADS}, **entry}
-    line = f"{name}: {as_flow(merged)}\n"
-    if not data:
-        return f"{text}\n{group}:\n  {line}"
-    head = re.search(rf"^{group}[ \t]*:[ \t]*(#[^\n]*)?\n", text, re.MULTILINE)
-    if head is None:
-        raise ConfigError(f"{group}: is written in one line; put {name}: {as_flow(merged)} in by hand")
-    here = re.compile(rf"^([ \t]+)([\"']?){re.escape(name)}\2[ \t]*:[^\n]*\n(?:\1[ \t]+\S[^\n]*\n)*", re.MULTILINE)
-    found = here.search(text, head.end()) if name in data else None
-    if found is None:
-        first = re.compile(r"[ \t]*").match(text, head.end())
-        indent = (first.group() if first else "") or "  "
-        return text[: head.end()] + indent + line + text[head.end() :]
-    return text[: found.start()] + found.group(1) + line + text[found.end() :]
+    changed, missing = with_values(text, {(group, name): merged})
+    if missing:
+        raise ConfigError(f"{key}: an alias shares it with another key; put {name}: {as_flow(merged)} in by hand")
+    return changed
 
 
 def changed(text: str, section: str, entries: Mapping[str, Mapping[str, Any]] | None = None) -> str:
     """Return a YAML text with the section `estimator` replaced or added, and with other entries."""
-    if text and not text.endswith("\n"):
-        text += "\n"
     text = with_section(text, "estimator", section)
     for key, entry in (entries or {}).items():
         text = with_entry(text, key, entry)

@@ -36,13 +36,19 @@ def test_the_section_gives_way_and_nothing_else(end, tmp_path):
     [
         ("noise:   # Q\n  a: {std: 2}  # by hand\n  b: {variance: 3}\ngate: null\n", {"b": {"variance": 3}}),
         ("noise:\n    # of old\n    a:\n      std: 2\n    b: {variance: 3}\ngate: null\n", {"b": {"variance": 3}}),
-        ("noise:\n  b: {variance: 3}\ngate: null\n", {"b": {"variance": 3}}),
+        ("noise:\n  # of b\n  b: {variance: 3}\ngate: null\n", {"b": {"variance": 3}}),
+        ("noise: {a: {std: 2}, b: {variance: 3}}  # Q\ngate: null\n", {"b": {"variance": 3}}),
+        ("noise: {b: {variance: 3}}\ngate: null\n", {"b": {"variance": 3}}),
+        ("noise:\ngate: null\n", {}),
         ("gate: null\n", {}),
     ],
 )
 def test_an_entry_takes_the_place_of_what_it_says_too(before, after):
     text = with_entry(before, "noise.a", {"variance": 4.0, "over": "3 s"})
     data, _ = parse(text, "x")
+    for comment in ("# Q", "# by hand", "# of old", "# of b"):
+        assert text.count(comment) == before.count(comment)
+    assert "# of b\n" not in before or "# of b\n  b:" in text
     assert data == {"noise": {"a": {"variance": 4, "over": "3 s"}, **after}, "gate": None}
 
 
@@ -50,8 +56,8 @@ def test_what_else_an_entry_says_stays():
     text = with_entry("sensors:\n  a: {std: 2, from: 1}\n", "sensors.a", {"variance": 1.0, "error": {"over": "2 s"}})
     data, _ = parse(text, "x")
     assert data["sensors"]["a"] == {"from": 1, "variance": 1, "error": {"over": "2 s"}}
-    with pytest.raises(ConfigError, match="sensors: is written in one line; put a: {variance: 1} in by hand"):
-        with_entry("sensors: {a: {std: 2}}\n", "sensors.a", {"variance": 1.0})
+    with pytest.raises(ConfigError, match="sensors.a: an alias shares it with another key; put a: {variance: 1} in by"):
+        with_entry("sensors:\n  a: &one {std: 2}\n  b: *one\n", "sensors.a", {"variance": 1.0})
 
 
 def test_a_file_without_the_section_gets_it():
