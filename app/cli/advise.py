@@ -35,7 +35,7 @@ from ..twin.log_reader import read_log
 from ..twin.twin import Twin, load_twin
 from .log import databases_of, look
 from .new import fit_draft, report_draft, roles_json
-from .options import check_output, roles_of, settings
+from .options import check_output, overrides_of, roles_of
 from .prepare import attend, prepare
 
 if TYPE_CHECKING:
@@ -73,7 +73,7 @@ def advise(arguments: Arguments) -> int:
 def _of_twin(arguments: Arguments, name: str) -> int:
     if arguments.out is not None:
         check_output("--out", arguments.out, ".yaml", ".yml", new="choose another name, or use --apply")
-    twin = load_twin(name, log_files=arguments.log or None, overrides=settings(arguments.set, arguments.estimator))
+    twin = load_twin(name, log_files=arguments.log or None, overrides=overrides_of(arguments))
     prepare(twin)
     log, _ = read_log(twin, arguments.duration)
     progress, begun = AdviceProgress(), time.monotonic()
@@ -87,7 +87,7 @@ def _of_twin(arguments: Arguments, name: str) -> int:
         return progress.question + ("" if left is None else f" About {left:.0f} s left")
 
     advice: Advice = attend(twin.model, work, "measuring", text=text)
-    print(to_json(advice_json(twin, log, advice)) if arguments.json else "\n".join(to_text(_topics(twin, log, advice))))
+    print(to_json(advice_json(twin, log, advice)) if arguments.json else to_text(_topics(twin, log, advice)))
     if arguments.apply or arguments.out is not None:
         path, out = twin.path, arguments.out
         kept = rewrite(path, lambda text: moved(changed(text, lines(advice), advice.sections), path, out or path), out)
@@ -130,7 +130,7 @@ def _draft(arguments: Arguments, files: tuple[Path, ...]) -> int:
     if arguments.json:
         print(to_json(_draft_json(every, drafted)))
     else:
-        print("\n".join(to_text([_signals_topic(every), *_plan_topics(drafted)])))
+        print(to_text([_signals_topic(every), *_plan_topics(drafted)]))
     if arguments.out is not None:
         written = write_draft(drafted, found, arguments.out.stem, arguments.out.parent, databases_of(arguments))
         if not arguments.json:

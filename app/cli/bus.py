@@ -13,7 +13,7 @@ from estimators.errors import ConfigError
 from ..present.result import to_json
 from ..terminal import complain, until_asked_to_end
 from ..twin.twin import Twin, load_twin
-from .options import settings
+from .options import overrides_of
 
 if TYPE_CHECKING:
     from .arguments import BusCommand
@@ -28,7 +28,7 @@ def play_bus(arguments: BusCommand) -> int:
     """Run the command."""
     if arguments.duration is not None and not arguments.duration > 0:
         raise ConfigError(f"--duration {arguments.duration:g}: must be positive")
-    twin = load_twin(arguments.twin, overrides=settings(arguments.set))
+    twin = load_twin(arguments.twin, overrides=overrides_of(arguments))
     if arguments.interface == "virtual" and arguments.record is None:
         raise ConfigError("--interface virtual: its frames stay in this process; use udp_multicast, or give --record")
     channel = _channel(arguments, twin)

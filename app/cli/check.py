@@ -22,13 +22,12 @@ def check_twin(arguments: Arguments) -> int:
     """Run the command."""
     twin = prepared(arguments)
     log, counts = read_log(twin, arguments.duration)
-    given = overrides_of(arguments)
-    with executor_of(arguments.cluster, twin, with_held(twin), arguments.twin, given) as executor:
+    with executor_of(arguments.cluster, twin, with_held(twin), arguments.twin, overrides_of(arguments)) as executor:
         checked: Checked = attend(twin.model, lambda: check(twin, log, counts, executor=executor), "checking")
     lines = checklist(checked)
     parts = topics(checked, lines)
     if arguments.html is not None:
         with writing(arguments.html, "--html"):
             arguments.html.write_text(to_html(f"nisus check {twin.name}", parts), encoding="utf-8")
-    print(to_json(figures(checked, lines)) if arguments.json else "\n".join(to_text(parts)))
+    print(to_json(figures(checked, lines)) if arguments.json else to_text(parts))
     return 0

@@ -15,7 +15,7 @@ from ..studies.commission import baseline_of, lines, section_file
 from ..terminal import complain
 from ..twin.log_reader import read_log
 from ..twin.twin import load_twin
-from .options import settings
+from .options import overrides_of
 from .prepare import prepare
 
 if TYPE_CHECKING:
@@ -25,7 +25,7 @@ if TYPE_CHECKING:
 def commission_twin(arguments: Arguments) -> int:
     """Carry the command out."""
     # What is normal is told from white innovations, not from what was normal before.
-    overrides = {**settings(arguments.set, arguments.estimator, arguments.tuning), "commissioned": "{}"}
+    overrides = {**overrides_of(arguments), "commissioned": "{}"}
     twin = load_twin(arguments.twin, log_files=arguments.log or None, overrides=overrides)
     prepare(twin)
     log, _ = read_log(twin, arguments.duration)

@@ -13,7 +13,7 @@ from ..studies.scores import FilterScore, cells, printed, row_json, write_scores
 from ..terminal import complain
 from ..twin.log_reader import read_logs
 from ..twin.twin import load_twin
-from .options import settings, span_of
+from .options import overrides_of, span_of
 from .prepare import prepare, progress
 
 if TYPE_CHECKING:
@@ -44,7 +44,7 @@ def compare_twin(arguments: Arguments) -> int:
 
 def _compare(arguments: Arguments, name: str) -> list[dict[str, Any]]:
     """Print the table of a twin, unless JSON is wanted, and return its rows for scripts."""
-    overrides = settings(arguments.set, tuning=arguments.tuning)
+    overrides = overrides_of(arguments)
     twin = load_twin(name, log_files=arguments.log or None, overrides=overrides)
     others = (
         *(arguments.estimators, arguments.set, arguments.tuning, arguments.log),

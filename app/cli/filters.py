@@ -40,10 +40,10 @@ def show_filters(arguments: Arguments) -> int:
                 f"{quoted(twin)}: no estimator or bundled twin; {nearest(twin, [*ESTIMATORS, *shipped()])}"
             )
     if twin is None:
-        print(to_json(catalogue_json(shown)) if arguments.json else "\n".join(to_text(catalogue(shown))))
+        print(to_json(catalogue_json(shown)) if arguments.json else to_text(catalogue(shown)))
         return 0
     found = applicable(load_twin(twin))
-    print(to_json(found) if arguments.json else "\n".join(to_text([applicable_topic(found)])))
+    print(to_json(found) if arguments.json else to_text([applicable_topic(found)]))
     return 0
 
 

@@ -30,7 +30,7 @@ from ..views.recording.rrd_file import parse_split
 from ..web.fleet import FleetApi
 from ..web.service import Service
 from ..web.supervisor import Supervisor
-from .options import settings
+from .options import overrides_of
 from .prepare import attend, compile_for
 from .serve import PRELOADED, door_of, run_child, serve_until_end
 
@@ -58,7 +58,7 @@ def run_fleet(arguments: FleetCommand) -> int:
         raise ConfigError(f"--worst {arguments.worst}: must be positive")
     if arguments.json and not arguments.headless:
         raise ConfigError("--json: is the result of a run without a page; give --headless")
-    overrides = settings(arguments.set, arguments.estimator, arguments.tuning)
+    overrides = overrides_of(arguments)
     plan = load_fleet(arguments.fleet, overrides)
     door = None if arguments.headless else door_of(arguments)
     plan.check_files()
@@ -107,7 +107,7 @@ def run_fleet(arguments: FleetCommand) -> int:
     if door is not None:
         return 0
     topics = fleet_topics(plan.twin.model, table, arguments.worst)
-    print(_json(plan, table) if arguments.json else "\n".join(to_text(topics)))
+    print(_json(plan, table) if arguments.json else to_text(topics))
     return 0
 
 

@@ -106,7 +106,7 @@ def fold_twin(arguments: Arguments) -> int:
             found, title = [item.episode for item in result.episodes], f"{twin.name}, {twin.estimator}"
             figure = plot_track(twin.model, events, track, episodes=found, title=title)
             figure.savefig(arguments.plot, dpi=150)
-    print(to_json(fold_json(result)) if arguments.json else "\n".join(to_text(fold_topics(result))))
+    print(to_json(fold_json(result)) if arguments.json else to_text(fold_topics(result)))
     return 0
 
 

@@ -10,7 +10,7 @@ from estimators.errors import ConfigError, printable
 
 from ..present.result import to_json, to_text
 from ..studies.guard import chosen, guard_all, guard_json, guard_topics, junit, keep_last
-from .options import check_output, settings
+from .options import check_output, overrides_of
 from .prepare import progress
 
 if TYPE_CHECKING:
@@ -26,8 +26,7 @@ def guard(arguments: Arguments) -> int:
     logs = chosen(arguments.twins, arguments.archive)
     note = printable(arguments.note).strip() if arguments.accept else None
     with progress("guard", len(logs), "recordings") as advance:
-        overrides = settings(arguments.set)
-        found = guard_all(logs, note, overrides, advance, jobs=arguments.jobs, cluster=arguments.cluster)
+        found = guard_all(logs, note, overrides_of(arguments), advance, jobs=arguments.jobs, cluster=arguments.cluster)
     absent_fails = os.environ.get("CI", "").lower() in ("true", "1")
     if not arguments.set:
         for twin in dict.fromkeys(each.twin for each in logs):
@@ -35,7 +34,7 @@ def guard(arguments: Arguments) -> int:
     if arguments.junit is not None:
         with writing(arguments.junit, "--junit"):
             arguments.junit.write_bytes(junit(found, absent_fails=absent_fails))
-    print(to_json(guard_json(found)) if arguments.json else "\n".join(to_text(guard_topics(found, absent_fails))))
+    print(to_json(guard_json(found)) if arguments.json else to_text(guard_topics(found, absent_fails)))
     if any(each.failure or (each.absent and absent_fails) for each in found):
         return 2
     return 0 if arguments.accept else int(any(figure.worse for each in found for figure in each.compared))

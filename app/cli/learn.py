@@ -28,7 +28,7 @@ from ..twin.learned import run_net
 from ..twin.log_reader import read_log
 from ..twin.model import physics_of
 from ..twin.twin import Twin, load_twin
-from .options import check_output, names_of, settings
+from .options import check_output, names_of, overrides_of
 from .prepare import attend, prepare
 
 if TYPE_CHECKING:
@@ -46,7 +46,7 @@ def learn_correction(arguments: Arguments) -> int:
             raise ConfigError(f"{option} names nothing; write names with commas")
     _check(arguments)
     net = None if arguments.net is None else run_net(arguments.net, len(features), len(corrects))
-    overrides = {**settings(arguments.set, arguments.estimator), "learned": "null"}
+    overrides = {**overrides_of(arguments), "learned": "null"}
     twins = [
         load_twin(arguments.twin, log_files=files or None, overrides=overrides)
         for files in ([Path(part) for part in text.split(",") if part] for text in arguments.log or ("",))
@@ -119,7 +119,7 @@ def learn_correction(arguments: Arguments) -> int:
     if arguments.json:
         print(to_json({"twin": twin.name, **as_dict(lesson)}))
     else:
-        print("\n".join(to_text(sections(twin.name, arguments.window, lesson, arguments.keep))))
+        print(to_text(sections(twin.name, arguments.window, lesson, arguments.keep)))
     if lesson.better and arguments.keep is not None:
         with writing(arguments.keep, "--keep"):
             arguments.keep.write_text(text(_beside(arguments.net, arguments.keep), scores_of(lesson)), encoding="utf-8")

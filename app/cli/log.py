@@ -62,7 +62,7 @@ def show_log(arguments: Arguments) -> int:
         complain(text)
     if len(found.faults) > MAX_LISTED:
         complain(f"and {len(found.faults) - MAX_LISTED} more faults")
-    print("\n".join(to_text([_topic(part) for part in found.parts or (found,)])))
+    print(to_text([_topic(part) for part in found.parts or (found,)]))
     return 0
 
 

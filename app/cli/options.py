@@ -50,24 +50,21 @@ def roles_of(options: RoleOptions) -> Roles:
     return Roles(*map(names_of, (options.sensors, options.inputs, options.hold_out, options.signals)))
 
 
-def settings(texts: Sequence[str], estimator: str | None = None, tuning: str | None = None) -> dict[str, str]:
-    """Return the KEY=VALUE pairs of `--set`, with `--estimator` and `--tuning` as two more.
+def overrides_of(arguments: Any) -> dict[str, str]:
+    """Return the KEY=VALUE pairs of `--set`, with `--estimator` and `--tuning`, where given, as two more.
 
     Raises:
         ConfigError: If one has no `=`, or no key before it.
     """
     pairs: dict[str, str] = {}
-    for text in texts:
+    for text in arguments.set:
         key, equals, value = text.partition("=")
         if not equals or not key.strip():
             lacks = "key" if equals else "value"
             raise ConfigError(f"--set {text}: has no {lacks}; write KEY=VALUE, for example --set R.winding=9")
         pairs[key.strip()] = value.strip()
-    if estimator is not None:
-        pairs["estimator"] = estimator
-    if tuning is not None:
-        pairs["tuning"] = tuning
-    return pairs
+    named = {name: getattr(arguments, name, None) for name in ("estimator", "tuning")}
+    return pairs | {name: value for name, value in named.items() if value is not None}
 
 
 def seconds_of(option: str, text: str) -> float:

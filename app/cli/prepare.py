@@ -23,7 +23,7 @@ from ..live.watchdog import CallWatch, interruptible
 from ..live.workshop import Workshop
 from ..terminal import complain, messages_file
 from ..twin.twin import Twin, load_twin
-from .options import settings
+from .options import overrides_of
 
 if TYPE_CHECKING:
     from rich.console import Console
@@ -38,11 +38,6 @@ def opened(arguments: Any) -> Twin:
         NisusError: If its YAML or its model is wrong.
     """
     return load_twin(arguments.twin, log_files=arguments.log or None, overrides=overrides_of(arguments))
-
-
-def overrides_of(arguments: Any) -> dict[str, str]:
-    """Return the overrides of `--set`, `--estimator` and `--tuning`."""
-    return settings(arguments.set, getattr(arguments, "estimator", None), getattr(arguments, "tuning", None))
 
 
 def prepared(arguments: Any) -> Twin:

@@ -34,7 +34,7 @@ def query(arguments: QueryCommand) -> int:
     columns = (column.to_pylist() for column in result.columns)
     rows = tuple(tuple(_cell(value) for value in row) for row in zip(*columns, strict=True))
     title = f"{result.num_rows} row{'' if result.num_rows == 1 else 's'}"
-    print("\n".join(to_text([Topic(title, columns=tuple(result.column_names), rows=rows)])))
+    print(to_text([Topic(title, columns=tuple(result.column_names), rows=rows)]))
     return 0
 
 

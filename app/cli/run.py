@@ -19,7 +19,7 @@ from ..web.gallery.gallery import StartRequest
 from ..web.gate import grants_of
 from ..web.session import Page, Session
 from .open_twin import FileOpener, open_session, opened_review, opened_twin
-from .options import settings
+from .options import overrides_of
 from .prepare import prepare
 
 if TYPE_CHECKING:
@@ -67,7 +67,7 @@ def run_twin(arguments: RunCommand, workers: Sequence[Compiler] = ()) -> int:
             opened_twin,
             arguments.twin,
             logs=arguments.log,
-            overrides=settings(arguments.set, arguments.estimator, arguments.tuning),
+            overrides=overrides_of(arguments),
             speed=speed,
             store=arguments.store,
             archive=arguments.archive,

@@ -12,7 +12,7 @@ from ..studies.stress.detection import Trial
 from ..studies.stress.results import stress_topics
 from ..studies.stress.trials import Trials, all_trials
 from ..terminal import complain
-from .options import settings
+from .options import overrides_of
 from .prepare import opened, prepare, progress
 
 if TYPE_CHECKING:
@@ -45,7 +45,7 @@ def stress_twin(arguments: Arguments) -> int:
     found: dict[int, Trial | str] = {}
     title = f"{twin.name}, {len(mistakes)} mistakes"
     folds = len(mistakes) * len(names) * arguments.seeds
-    overrides = settings(arguments.set, tuning=arguments.tuning)
+    overrides = overrides_of(arguments)
     ended = False
     with progress(title, folds, "folds") as advance:
         try:
@@ -66,5 +66,5 @@ def stress_twin(arguments: Arguments) -> int:
         mistakes = [item for item in mistakes if any(trial.mistake == item.name for trial in trials)]
     for text in failed:
         complain(text)
-    print(to_json(trials) if arguments.json else "\n".join(to_text(stress_topics(title, trials, mistakes))))
+    print(to_json(trials) if arguments.json else to_text(stress_topics(title, trials, mistakes)))
     return 130 if ended else 0

@@ -32,7 +32,7 @@ from ..terminal import complain
 from ..twin.defaults import bounds_of, natural_aim, width_priors
 from ..twin.log_reader import read_log, read_logs
 from ..twin.twin import Twin, load_twin, with_held
-from .options import check_output, names_of, seconds_of, settings, span_of
+from .options import check_output, names_of, overrides_of, seconds_of, span_of
 from .prepare import attend, fold_log, prepare
 
 if TYPE_CHECKING:
@@ -94,7 +94,7 @@ def tune_twin(arguments: Arguments) -> int:
         print(json.dumps({"twin": twin.name, **fit_json(found)}, allow_nan=False))
     else:
         written = arguments.apply or any((arguments.out, arguments.save, arguments.keep))
-        print("\n".join(to_text(sections(twin, found, aim, written=written))))
+        print(to_text(sections(twin, found, aim, written=written)))
     if not found.proposed:
         return 1
     _save(arguments, twin, found, arguments.log or (f"{twin.name}, its own log",))
@@ -102,8 +102,7 @@ def tune_twin(arguments: Arguments) -> int:
 
 
 def _executor(arguments: Arguments, twin: Twin, held: Twin) -> AbstractContextManager[Executor | str]:
-    overrides = settings(arguments.set, arguments.estimator)
-    return executor_of(arguments.cluster, twin, held, arguments.twin, overrides)
+    return executor_of(arguments.cluster, twin, held, arguments.twin, overrides_of(arguments))
 
 
 def _attend_fit(
@@ -135,7 +134,7 @@ def _save(arguments: Arguments, twin: Twin, found: Fitted, fitted_on: Sequence[s
 
 def _recordings(arguments: Arguments, wanted: Sequence[str]) -> tuple[Twin, list[Recording]]:
     """Return the twin, and its recordings, simulated logs, or own log."""
-    overrides = settings(arguments.set, arguments.estimator)
+    overrides = overrides_of(arguments)
     if not arguments.log:
         twin = load_twin(arguments.twin, overrides=overrides)
         _prepare_fit(arguments, wanted, twin)
@@ -239,7 +238,7 @@ def tune_windows(arguments: Arguments, wanted: Sequence[str], windows: str, bloc
         listed = [window_json(k, refit, origins[k]) for k, refit in found]
         print(json.dumps({"twin": twin.name, "window": window, "every": every, "windows": listed}, allow_nan=False))
     else:
-        print("\n".join(to_text([*window_topics(found, origins), windows_verdict(twin, found, origins, ends)])))
+        print(to_text([*window_topics(found, origins), windows_verdict(twin, found, origins, ends)]))
     adopted = [refit.fitted for _, refit in found if refit.fitted is not None and refit.proposed]
     if not adopted:
         return 1

@@ -116,7 +116,7 @@ def _list(arguments: Arguments) -> None:
     topics = [Topic(f"Tuning versions of {twin.name}", ("* accepted: `nisus guard` folds with it.",), columns, rows)]
     if broken := tuple(item["error"] for item in listed if "error" in item):
         topics.append(Topic("Cannot be read", broken))
-    print("\n".join(to_text(topics)))
+    print(to_text(topics))
 
 
 def _mean_coverage(scores: dict[str, float]) -> float | None:
@@ -155,7 +155,7 @@ def _compare(arguments: Arguments) -> None:
     entries_of = tuple((key, _value_text(before), _value_text(after)) for key, before, after in differ)
     differing = Topic("Entries that differ", () if entries_of else ("None.",), ("entry", *names), entries_of)
     scored = Topic("Scores", () if rows else ("Both versions need scores.",), ("score", *names, ""), rows)
-    print("\n".join(to_text([differing, scored])))
+    print(to_text([differing, scored]))
 
 
 def _verdict(name: str, before: float, after: float) -> str:

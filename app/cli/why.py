@@ -44,7 +44,7 @@ def explain_change(arguments: Arguments) -> int:
     with np.errstate(divide="ignore", invalid="ignore"):
         order = np.argsort(-np.abs(found.after - found.before) / np.where(std > 0.0, std, np.inf), kind="stable")
     chosen = [names.index(name) for name in arguments.state] or sorted(order[:MAX_COLUMNS].tolist())
-    print("\n".join(to_text(why_topics(twin.model, found, origin, chosen))))
+    print(to_text(why_topics(twin.model, found, origin, chosen)))
     if not arguments.state and len(names) > MAX_COLUMNS:
         print(f"\n  {len(names) - MAX_COLUMNS} other states moved by fewer σ; --state names them")
     return 0

@@ -151,8 +151,8 @@ def to_json(value: Any) -> str:
     return json.dumps(plain(value), allow_nan=False)
 
 
-def to_text(topics: Sequence[Topic]) -> list[str]:
-    """Return the lines of the topics, one blank line between them."""
+def to_text(topics: Sequence[Topic]) -> str:
+    """Return the topics as text, one blank line between them."""
     lines: list[str] = []
     for topic in topics:
         lines += ["", topic.title] if lines else [topic.title]
@@ -161,7 +161,7 @@ def to_text(topics: Sequence[Topic]) -> list[str]:
         width = max((len(figure.name) for figure in topic.figures), default=0)
         lines += [f"  {figure.name:<{width}}  {figure.text()}" for figure in topic.figures]
         lines += _table_lines(topic)
-    return lines
+    return "\n".join(lines)
 
 
 def _table_lines(topic: Topic) -> list[str]:

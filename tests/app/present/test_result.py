@@ -24,11 +24,11 @@ from app.present.result import (
 def test_wide_rows_become_paragraphs_whose_short_cells_keep_their_heading():
     note = "why it was kept " * 12
     head = ("version", "saved", "filter", "NIS", "note")
-    narrow = to_text([Topic("Versions", (), head, (("a", "today", "kf", "0.95", "short"),))])
+    narrow = to_text([Topic("Versions", (), head, (("a", "today", "kf", "0.95", "short"),))]).splitlines()
     assert narrow[1].split() == list(head) and narrow[2].split() == ["a", "today", "kf", "0.95", "short"]
     two = (*head, "reason")
     rows = (("a", "today", "kf", "0.95", note, note), ("b", "-", "ekf", "-", note, ""))
-    wide = to_text([Topic("Versions", (), two, rows)])
+    wide = to_text([Topic("Versions", (), two, rows)]).splitlines()
     assert wide[1:3] == ["  a today", "      filter kf, NIS 0.95"]
     assert "      filter ekf" in wide and max(map(len, wide)) <= WIDTH
     assert " ".join(" ".join(wide).split()).count("why it was kept") == 36
@@ -36,7 +36,7 @@ def test_wide_rows_become_paragraphs_whose_short_cells_keep_their_heading():
 
 def test_a_long_last_cell_is_wrapped_below_itself():
     rows = (("kf", "because it is not linear " * 12), ("ekf", "yes"))
-    lines = to_text([Topic("Filters", (), ("name", "applies"), rows)])
+    lines = to_text([Topic("Filters", (), ("name", "applies"), rows)]).splitlines()
     assert lines[1].split() == ["name", "applies"] and lines[2].startswith("  kf    because")
     assert lines[3].startswith("        ") and lines[-1] == "  ekf   yes"
     assert max(map(len, lines)) <= MAX_TABLE_WIDTH and " ".join(lines).count("because") == 12
@@ -55,7 +55,7 @@ def test_numbers_have_the_digits_that_matter(value, decimals, scale, text):
 def test_numbers_are_aligned_to_the_right_and_missing_ones_are_dashes():
     columns = ("name", TableColumn("share [%]", decimals=1, scale=100.0), "n")
     topic = Topic("Shares", ("One sentence.",), columns, (("a", 0.05, 7), ("b", np.nan, 1200)))
-    assert to_text([topic, Topic("End", figures=(Figure("gain", 0.12345, "K", "on 3 logs"),))]) == [
+    assert to_text([topic, Topic("End", figures=(Figure("gain", 0.12345, "K", "on 3 logs"),))]).splitlines() == [
         "Shares",
         "  One sentence.",
         "  name  share [%]      n",
