@@ -22,7 +22,7 @@ from .events.maintenance import versions_dropped
 from .fold_checks import check_base, check_log, check_pairs, check_prior, check_soft, check_tuning
 from .fold_machine import Machine, Moments, variances_of
 from .gate.isolation import Decision, decide
-from .log import BEFORE, MAINTENANCE, MARK, TICK, TRUTH, Log
+from .log import BEFORE, MAINTENANCE, MARK, TICK, TRUTH, Events, Log
 from .model.state_space import StateSpaceModel
 from .numerics.peaks import Peak
 from .registry import find_estimator
@@ -110,6 +110,11 @@ class Fold:
         self._asked = -1
         self._remember(self._now.copy())
         self._rows = self._machine.rows(max(log.capacity, room))
+
+    @property
+    def events(self) -> Events:
+        """Views of the events that are folded."""
+        return self.log.events.select(slice(0, self.n))
 
     @property
     def track(self) -> Track:

@@ -71,7 +71,7 @@ def _compare(arguments: Arguments, name: str) -> list[dict[str, Any]]:
             ended = True
             complain(f"interrupted after {len(rows)} of {len(names)} filters")
     rows.sort(key=lambda row: names.index(row.estimator))
-    lines = cells(rows, len(logs[0]), float(logs[0].t[-1] - logs[0].t[0]) * 1e-9)
+    lines = cells(rows, len(logs[0]), logs[0].seconds)
     if not arguments.json:
         print("\n".join(printed(twin.path.stem, lines, len(logs))))
     if ended:

@@ -204,7 +204,7 @@ def event_window(
         first = fold.log.first
         index = -(-(first + index) // PERMANENT_SPACING) * PERMANENT_SPACING - first
     at, base = fold.base_at(index)
-    events = Events(*(column[at:stop].copy() for column in fold.log.events))
+    events = fold.log.events.select(slice(at, stop)).copy()
     track = fold.track.select(slice(at, stop) if rows else slice(0, 0)).copy()
     return EventWindow(fold.estimator.name, fold.tuning, events, track, base if at else origin, revision)
 

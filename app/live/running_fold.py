@@ -227,7 +227,7 @@ class Running(ABC):
             fresh, cursor.log = cursor.log != self._logs, self._logs
             start = log.first if fresh else max(cursor.next, log.first)
             cursor.next = log.first + log.n
-            events = Events(*(column.copy() for column in log.events.select(slice(start - log.first, None))))
+            events = log.events.select(slice(start - log.first, None)).copy()
             settings, taken = (self._base, self.estimator, self.tuning), (self._taken, self._intake_state, self._mark)
             return LogTail(fresh, start, events, log.first, log.floor, *settings, *taken)
 
@@ -251,7 +251,7 @@ class Running(ABC):
 
     def _copy(self, start: int, stop: int, *, fresh: bool = False, **fields: Any) -> Pull:
         log, fold, rows = self._log, self._fold, slice(start - self._log.first, stop - self._log.first)
-        events, track = Events(*(column.copy() for column in log.events.select(rows))), fold.track.select(rows).copy()
+        events, track = log.events.select(rows).copy(), fold.track.select(rows).copy()
         settings = fold.tuning, fold.estimator.name
         pull = Pull(
             self._revision, fresh, start, events, track, oldest=log.first, version=log.version, settings=settings

@@ -86,7 +86,7 @@ def status_of(
         },
         account=fold.account(),
         nis=nis,
-        sensor_nis=_nis_of_sensors(log.events.select(slice(0, fold.n)), track, len(model.sensors)),
+        sensor_nis=_nis_of_sensors(fold.events, track, len(model.sensors)),
         grades=own_grades(model, track, fold.u) if last >= 0 else {},
         latency_ms=watchers.latency.percentile(99.0),
         latency_p50_ms=watchers.latency.percentile(50.0),

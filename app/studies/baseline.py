@@ -59,7 +59,7 @@ SAME_LOG = 1e-9  # relative difference of the sums of one simulated log on two p
 def fold_figures(fold: Fold, rows: np.ndarray | None = None) -> dict[str, float]:
     """Return every figure of a finished fold, or of those rows (mask, (n,)); the NIS is per degree of freedom."""
     rows = np.ones(fold.n, bool) if rows is None else rows
-    track, events = fold.track.select(rows), fold.log.events.select(slice(0, fold.n)).select(rows)
+    track, events = fold.track.select(rows), fold.events.select(rows)
     # A picture shows the field before its event.
     pictures = [one for one in pictures_of(fold) if 0 < one.before <= rows.size and rows[one.before - 1]]
     found = figures(score(track, events, fold.model, pictures, gate=fold.tuning.gate))
@@ -107,7 +107,7 @@ def _allowance(without: Sequence[float], count: int | None) -> float:
 
 def _error_counts(fold: Fold) -> dict[str, int]:
     """Return the number of errors of each state with known truth, and of each held-out row."""
-    model, track, events = fold.model, fold.track, fold.log.events.select(slice(0, fold.n))
+    model, track, events = fold.model, fold.track, fold.events
     found = {model.state_names[j]: truth_of(events, int(j))[0].size for j in model.shown}
     held = track.verdict == HELD_OUT
     for s, sensor in enumerate(model.sensors):

@@ -107,7 +107,7 @@ def check(twin: Twin, log: Log, counts: Counter[str], *, executor: Executor | st
     fold, seconds = timed(twin, twin.estimator, log.events, tuning.seed, BUDGET_S / (reporting + 2))
     span = None
     if fold.n < log.n:
-        span = float(log.t[fold.n - 1] - log.t[0]) * 1e-9
+        span = fold.events.seconds
         log.n = fold.log.n = fold.n
     fold.finish()
     measured = Measured(twin, log, executor=executor)
@@ -312,7 +312,7 @@ def figures(checked: Checked, checklist: Sequence[ChecklistLine]) -> dict[str, A
 def topics(checked: Checked, checklist: Sequence[ChecklistLine]) -> list[Topic]:
     """Return a check as topics: title, checklist, faults, observability, held-out sensors, timing, health."""
     twin, log = checked.twin, checked.log
-    seconds = float(log.t[log.n - 1] - log.t[0]) * 1e-9
+    seconds = log.events.seconds
     part = "the first" if checked.span is not None else "all"
     head = f"{twin.estimator} over {part} {seconds:.4g} s of its log, {log.n:,} events, {checked.dimension.nx:,} states"
     lines = tuple((line.question, line.answer, line.figures, line.remedy) for line in checklist)

@@ -86,7 +86,7 @@ def against(fold: Fold) -> str:
     if lost > MAX_FAULTY_SHARE:
         return f"the twin is diverged or stale for {100 * lost:.0f} % of its rows"
     for s, sensor in enumerate(model.sensors):
-        rows = log.events.select(slice(0, fold.n)).of_sensor(s)
+        rows = fold.events.of_sensor(s)
         if not rows.size:
             continue
         refused = float(np.mean(np.isin(track.verdict[rows], (GATED, FAILED, SCREENED))))
@@ -100,7 +100,7 @@ def against(fold: Fold) -> str:
                 return f"{row.name} of {sensor.name} says the same {longest} times in a row"
     for row_name, why in contradictions(fold).items():
         return f"{row_name} contradicts its own log, {why}"
-    scored = score(track, log.events.select(slice(0, fold.n)), model)
+    scored = score(track, fold.events, model)
     for state, fit in scored.states.items():
         if fit.coverage < MIN_COVERAGE:
             return f"the true {state} is in its 95 % band only {100 * fit.coverage:.0f} % of the time"

@@ -73,7 +73,7 @@ def fold_row(
                 twin, estimator, events, k, share if k == 0 else np.inf, MIN_TIMED_S if k == 0 else 0.0
             )
             if fold.n < len(events):
-                span = tidy((events.t[fold.n - 1] - events.t[0]) * 1e-9)
+                span = tidy(fold.events.seconds)
                 events = within(events, span)
             outcomes.append(outcome_of(fold, events, seconds, scored))
     except NisusError as error:

@@ -322,7 +322,7 @@ def _span(guarded: GuardedLog, twin: Twin) -> float | None:
         begun = time.process_time()
         fold.advance()
         needed = logs * (read + seeds * (time.process_time() - begun))
-        seconds = float(log.t[log.n - 1] - log.t[0]) * 1e-9
+        seconds = log.events.seconds
         if needed > BUDGET_S:
             return tidy(seconds * BUDGET_S / needed)
         if seconds < 0.5 * part:

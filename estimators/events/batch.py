@@ -84,6 +84,15 @@ class Events(NamedTuple):
         """Return the indices of the measurements of a sensor."""
         return np.flatnonzero((self.kind == READING) & (self.channel == sensor))
 
+    def copy(self) -> Events:
+        """Return a copy."""
+        return Events(*(column.copy() for column in self))
+
+    @property
+    def seconds(self) -> float:
+        """Time from the first event to the last, s; 0 without events."""
+        return float(self.t[-1] - self.t[0]) * 1e-9 if len(self) else 0.0
+
     def __len__(self) -> int:
         """Return the number of events (not of columns)."""
         return self.t.size

@@ -109,7 +109,7 @@ def fold(
         track = smooth(folded).instead_of(folded.track)
     else:
         track = fold_track(estimator, model, tuned, log, pairs=pairs, policy=policy, prior=prior)
-    return Estimates(estimator, model, tuned, _copied(log), track, covariance)
+    return Estimates(estimator, model, tuned, log.events.copy(), track, covariance)
 
 
 def fold_many(
@@ -181,7 +181,7 @@ def fold_many(
                     f"fold_many: processes cannot be given {model.name} ({error}); define its functions in a "
                     'module, or use executor="threads"'
                 ) from None
-    copies = {id(each): _copied(each) for each in logs}
+    copies = {id(each): each.events.copy() for each in logs}
     return [
         Estimates(estimator, model, tuned, copies[id(each)], track, covariance)
         for (each, tuned), track in zip(jobs, tracks, strict=True)
@@ -220,11 +220,6 @@ def _check_named(log: Log, model: StateSpaceModel) -> None:
                 f"the log is of {log.model.name}, with the {what} {', '.join(names[:8]) or 'none'}; {model.name} has "
                 f"{', '.join(wanted[:8]) or 'none'}: make the log by Log.of(model)"
             )
-
-
-def _copied(log: Log) -> Events:
-    """Return copies of the log's present events."""
-    return Events(*(column.copy() for column in log.events))
 
 
 def all_pairs(model: StateSpaceModel) -> np.ndarray:

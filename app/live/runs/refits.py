@@ -146,7 +146,7 @@ class Fitting:
 
         log, base = self._log(attempt, most, since, job)
         attempt.progress = objective.FitProgress()
-        attempt.events, attempt.seconds = log.n, float(log.t[log.n - 1] - log.t[0]) * 1e-9
+        attempt.events, attempt.seconds = log.n, log.events.seconds
         config = self._engine.twin.config
         try:
             # Data say the widths of parameters that the filter considers, so the fit holds them.

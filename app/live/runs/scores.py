@@ -105,9 +105,8 @@ class RunScores:
     def _scored(self, run: Revision, pull: Pull) -> RunScore:
         gate, baseline, model = run.tuning.gate, run.tuning.baseline, self._engine.model
         found = score(pull.track, pull.events, model, pull.pictures, gate=gate, baseline=baseline)
-        t, known = pull.events.t, self._known.get(run.number)
-        seconds = float(t[-1] - t[0]) * 1e-9 if t.size else 0.0
-        made = RunScore(found, len(pull.events), seconds, np.nan if known is None else known.step_us)
+        known = self._known.get(run.number)
+        made = RunScore(found, len(pull.events), pull.events.seconds, np.nan if known is None else known.step_us)
         return made if np.isfinite(made.step_us) else replace(made, step_us=_step_us(self._engine, run))
 
 

@@ -124,7 +124,7 @@ def _draw_states(axes: Axes, series: TrackSeries, names: Sequence[str] | None) -
     bands = [series[f"{kind}:{main}"][1] for kind in ("upper", "lower")]
     shown = np.concatenate([part[len(part) // 30 :] for part in lines] + [part[len(part) // 10 :] for part in bands])
     axes.set_ylim(float(np.nanmin(shown)), float(np.nanmax(shown)) + 1e-12)
-    axes.set_xlim(0.0, float(series.events.t[-1] - series.events.t[0]) * 1e-9)
+    axes.set_xlim(0.0, series.events.seconds)
 
 
 def _path_of(

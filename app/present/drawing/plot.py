@@ -267,7 +267,7 @@ def plot_track(
     measured = [name for name in sorted(counts, key=lambda name: -counts[name])[:MAX_INNOVATIONS] if counts[name]]
     measured = [name for name in counts if name in measured]
     figure = new_figure(PANEL_INCHES[0], PANEL_INCHES[1] * (len(states) + len(measured) + 1))
-    span = (events.t[-1] - events.t[0]) * 1e-9
+    span = events.seconds
     unit, first, units = time_unit(float(span)), int(events.t[0]) * 1e-9, units_by_name(model)
     panels = figure.subplots(len(states) + len(measured) + 1, 1, sharex=True, squeeze=False)[:, 0]
     for axes, state in zip(panels, states, strict=False):

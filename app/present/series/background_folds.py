@@ -17,7 +17,7 @@ import numpy as np
 
 from estimators.errors import EstimatorError
 from estimators.fold import Fold
-from estimators.log import Events, Log
+from estimators.log import Log
 from estimators.pieces import SMOOTHER
 from estimators.smoothing.smooth import check_smooth, smooth
 
@@ -100,7 +100,7 @@ class PinnedFold:
         log, n = self._fold.log, self._fold.n
         start = min(max(start, log.first), log.first + n)
         rows = slice(start - log.first, max(start, min(stop, log.first + n)) - log.first)
-        events = Events(*(column.copy() for column in log.events.select(rows)))
+        events = log.events.select(rows).copy()
         return Pull(self.run.number, False, start, events, self._fold.track.select(rows).copy(), oldest=log.first)
 
     def fail(self, reason: str) -> None:

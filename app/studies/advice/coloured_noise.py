@@ -142,7 +142,7 @@ def _candidates(model: StateSpaceModel, estimator: str, trial: _Trial, row: Cali
     fold = trial.fold
     index = fold.model.row_names.index(row.subject)
     k = int(np.searchsorted(fold.model.row_start, index, side="right")) - 1
-    rows = fold.log.events.select(slice(0, fold.n)).of_sensor(k)
+    rows = fold.events.of_sensor(k)
     column = index - int(fold.model.row_start[k])
     innovation = fold.track.innovation[rows, column]
     period = float(np.median(np.diff(fold.log.t[rows]))) * 1e-9

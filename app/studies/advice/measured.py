@@ -62,7 +62,7 @@ def without_faults(twin: Twin, log: Log, known: Sequence[Episode] | None = None)
         known = episodes(Measured(twin, log).folded(twin.estimator).fold)
     t, clean = log.t[: log.n] * 1e-9, log.copy()
     found: list[Exclusion] = []
-    for sensor, row, column, readings in sensor_rows(twin.model, log.events.select(slice(0, log.n))):
+    for sensor, row, column, readings in sensor_rows(twin.model, log.events):
         left_out, listed = np.zeros(log.n, bool), []
         for item in known:
             detector = detector_of(item.cause)
@@ -83,7 +83,7 @@ def repeats_of(model: StateSpaceModel, log: Log) -> dict[str, Finding]:
     """Return how the measurements of each sensor row repeat."""
     return {
         row: find_repeats(log.t[: log.n][known], log.value[: log.n, column][known])
-        for _, row, column, known in sensor_rows(model, log.events.select(slice(0, log.n)))
+        for _, row, column, known in sensor_rows(model, log.events)
         if known.any()
     }
 

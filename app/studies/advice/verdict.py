@@ -267,7 +267,7 @@ def advice_json(twin: Twin, log: Log, told: Advice) -> dict[str, Any]:
     return {
         "twin": twin.name,
         "has": twin.estimator,
-        "seconds": float(log.t[log.n - 1] - log.t[0]) * 1e-9,
+        "seconds": log.events.seconds,
         "estimator": told.estimator,
         "options": told.options,
         "because": list(told.because),

@@ -130,7 +130,7 @@ class Diagnosis:
             "revision": revision,
             "estimator": estimator,
             "events": len(events),
-            "span": float(events.t[-1] - events.t[0]) * 1e-9 if len(events) else 0.0,
+            "span": events.seconds,
             "marginal": marginal,
             "rows": _agreed(rows_json(engine.model, events, track, tuning, marginal=marginal), status),
             "rows_in_all": len(engine.model.row_names),

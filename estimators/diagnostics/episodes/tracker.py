@@ -48,7 +48,7 @@ def episodes_of(judged: JudgedRows) -> list[Episode]:
 
 def judged_rows(fold: Fold) -> JudgedRows:
     """Return the rows of a fold so far, as views."""
-    events, stale_after = fold.log.events.select(slice(0, fold.n)), fold.policy.stale_after
+    events, stale_after = fold.events, fold.policy.stale_after
     return JudgedRows(fold.model, fold.tuning, fold.marginal, events, fold.track, stale_after=stale_after)
 
 

@@ -153,7 +153,7 @@ def gramian(
         fold.advance(k - fold.n)
         mean, _ = fold.moments()
         bases.append(Base(mean, model.prior_cov, fold.clock, fold.u))
-    reason = astray(estimator, name, fold.track.select(slice(0, fold.n)))
+    reason = astray(estimator, name, fold.track)
     if reason:
         return Gramian(name, reason, note, None, ())
     spans = list(zip(begins, [*begins[1:], log.n], bases, strict=True))

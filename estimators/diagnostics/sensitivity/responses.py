@@ -418,7 +418,7 @@ def nudges_of(
     `track`: of the log, by which the priors of states have a range.
     """
     found, others = [], []
-    seconds = float(log.t[log.n - 1] - log.t[0]) * 1e-9 if log.n else 0.0
+    seconds = log.events.seconds
     units = [row.unit for sensor in model.sensors for row in sensor.rows]
     kind = log.events.kind
     reporting = tuning.used & np.isin(np.arange(len(model.sensors)), log.events.channel[kind == READING])
