@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import threading
 import time
 from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import Future, wait
@@ -18,7 +17,7 @@ from estimators.registry import ESTIMATORS, unfit
 from sources.pieces import make, pieces_of
 
 from ..live.compilers import Compiler
-from ..live.jobs import start_in_thread
+from ..live.jobs import LoopThread, start_in_thread
 from ..live.watchdog import CallWatch, interruptible
 from ..live.workshop import Workshop
 from ..terminal import complain, messages_file
@@ -207,19 +206,17 @@ def _shown(text: Callable[[], str], console: Console, first: str = "") -> Iterat
 @contextmanager
 def _every(seconds: float, call: Callable[[], Any]) -> Iterator[None]:
     """Call a function at intervals, in a thread of its own."""
-    ended = threading.Event()
 
     def run() -> None:
-        while not ended.wait(seconds):
+        while not thread.stopping.wait(seconds):
             call()
 
-    thread = threading.Thread(target=run, name="progress", daemon=True)
+    thread = LoopThread(run, "progress")
     thread.start()
     try:
         yield
     finally:
-        ended.set()
-        thread.join()
+        thread.stop()
 
 
 @contextmanager

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 from estimators.errors import NisusError
 from sources.source import controls_of
 
-from .jobs import join
+from .jobs import LoopThread
 
 if TYPE_CHECKING:
     from estimators.log import Events
@@ -63,9 +63,8 @@ class Feeder:
         self.waits = not self.live or getattr(self.innermost, "waits", False)
         """Whether the source waits for the engine, as files do and a bus does not."""
         self._mark = 0
-        self._stop = threading.Event()
         self._room = threading.Semaphore(MAX_BATCHES_AHEAD)
-        self._thread = threading.Thread(target=self._run, name="source", daemon=True)
+        self._thread = LoopThread(self._run, "source")
 
     def start(self) -> None:
         """Begin to read."""
@@ -73,9 +72,9 @@ class Feeder:
 
     def stop(self) -> None:
         """Stop reading and close the source."""
-        self._stop.set()
+        self._thread.stopping.set()
         self._room.release()
-        join(self._thread, 2.0)
+        self._thread.stop(2.0)
         self.source.close()
 
     def taken(self) -> None:
@@ -114,7 +113,7 @@ class Feeder:
 
     def _run(self) -> None:
         wait, ended = 0.1, False
-        while not self._stop.is_set():
+        while not self._thread.stopping.is_set():
             try:
                 if self.read(READ_TIMEOUT_S) is not None:
                     ended = False
@@ -132,7 +131,7 @@ class Feeder:
                 if not self.live:
                     self._inbox.put(self._finished)
                     return
-                if self._stop.wait(wait):
+                if self._thread.stopping.wait(wait):
                     return
                 wait = min(MAX_RETRY_S, 2 * wait)
                 self._reopen()

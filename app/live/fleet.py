@@ -28,7 +28,7 @@ from ..ingest import CLOCK_MOVED, clock_lines, refusal
 from ..twin.fleet import FleetPlan
 from ..twin.twin import Twin
 from .fold_json import tuning_to_json
-from .jobs import join
+from .jobs import LoopThread
 from .outcomes import Outcomes
 from .silent_assets import SilentAssets
 from .store import RETRY_PERIOD_S, Store
@@ -148,8 +148,7 @@ class RunningFleet:
         """Why the source failed."""
         self._lock = threading.Lock()
         self._shown: tuple[int, FleetTable] | None = None
-        self._stopping = threading.Event()
-        self._thread = threading.Thread(target=self._run, name="fleet", daemon=True)
+        self._thread = LoopThread(self._run, "fleet")
         self.outcomes = Outcomes()
         self._passed: list[Passing] = []
         self._changed: set[int] = set()
@@ -218,8 +217,7 @@ class RunningFleet:
 
     def stop(self) -> None:
         """Stop, and close the source."""
-        self._stopping.set()
-        join(self._thread, 30.0)
+        self._thread.stop(30.0)
         self.source.close()
         if self._store is not None:
             self._store.close()
@@ -228,7 +226,7 @@ class RunningFleet:
 
     def _run(self) -> None:
         try:
-            self.run(lambda: not self._stopping.is_set())
+            self.run(lambda: not self._thread.stopping.is_set())
         except Exception as error:  # noqa: BLE001  the overview stays, and says why nothing is folded any more
             self.failure = str(error) if isinstance(error, NisusError) else f"{type(error).__name__}: {error}"
             self.note(STOPPED, f"the fleet stands still: {self.failure}")

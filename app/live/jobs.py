@@ -275,10 +275,19 @@ class Jobs:
             self._put(job, again)
 
 
-def join(thread: threading.Thread, seconds: float) -> None:
-    """Wait for the end of a thread, if it was started, and no longer than so many seconds."""
-    if thread.is_alive():
-        thread.join(seconds)
+class LoopThread(threading.Thread):
+    """Daemon thread of a loop, which ends soon after `stopping` is set."""
+
+    def __init__(self, run: Callable[[], Any], name: str) -> None:
+        """Prepare; nothing runs before `start`."""
+        super().__init__(target=run, name=name, daemon=True)
+        self.stopping = threading.Event()
+
+    def stop(self, seconds: float | None = None) -> None:
+        """Let the loop end, and wait for that if it was started, no longer than so many seconds."""
+        self.stopping.set()
+        if self.is_alive():
+            self.join(seconds)
 
 
 def run_all(*works: Callable[[], Any]) -> None:

@@ -21,7 +21,7 @@ from estimators.model.state_space import StateSpaceModel
 from estimators.numerics.jit import plain
 
 from ..terminal import complain
-from .jobs import start_in_thread
+from .jobs import LoopThread, start_in_thread
 
 if TYPE_CHECKING:
     from estimators.fold import Fold
@@ -118,8 +118,7 @@ class Watchdog:
         self._asked: tuple[float, Fold] | None = None
         self.text: str | None = None
         """Line about the fold that does not return; None while all is well."""
-        self._stop = threading.Event()
-        self._thread = threading.Thread(target=self._run, name="stall", daemon=True)
+        self._thread = LoopThread(self._run, "stall")
 
     def start(self) -> None:
         """Watch until `stop`."""
@@ -127,7 +126,7 @@ class Watchdog:
 
     def stop(self) -> None:
         """Stop watching."""
-        self._stop.set()
+        self._thread.stopping.set()
 
     @property
     def busy(self) -> float:
@@ -145,7 +144,7 @@ class Watchdog:
             self._work = None
 
     def _run(self) -> None:
-        while not self._stop.wait(0.5):
+        while not self._thread.stopping.wait(0.5):
             self.look()
 
     def look(self) -> None:

@@ -16,7 +16,7 @@ from estimators.pieces import LOOP, Piece
 from sources.pieces import KERNELS, is_made, make, needs, pieces_of
 
 from .compilers import MAX_COMPILERS, Compiler
-from .jobs import LOWEST_PRIORITY, join
+from .jobs import LOWEST_PRIORITY, LoopThread
 
 POLL_PERIOD_S = 0.2
 """Seconds between two looks for new requests."""
@@ -57,8 +57,7 @@ class Workshop:
         self.report: Callable[[str], None] = lambda text: None
         """Called with a line about a failure, in another thread."""
         self._wake = threading.Condition()
-        self._stopping = False
-        self._thread = threading.Thread(target=self._run, name="workshop", daemon=True)
+        self._thread = LoopThread(self._run, "workshop")
 
     def start(self) -> None:
         """Begin; with nothing to compile there is no thread and no process."""
@@ -71,9 +70,9 @@ class Workshop:
     def stop(self) -> None:
         """Stop compiling."""
         with self._wake:
-            self._stopping = True
+            self._thread.stopping.set()
             self._wake.notify()
-        join(self._thread, 2.0)
+        self._thread.stop(2.0)
 
     def ready(self, name: str) -> bool:
         """Return whether a filter or decoder is in the cache."""
@@ -114,7 +113,7 @@ class Workshop:
                 with self._wake:
                     self._take_answers()
                     self._tell()
-                    if self._stopping or not self._left:
+                    if self._thread.stopping.is_set() or not self._left:
                         return
                     hurried = [worker for worker in hurried if not worker.ended]
                     quiet = None if quiet is not None and quiet.ended else quiet

@@ -17,7 +17,7 @@ import numpy as np
 from config.output_schema import AlertSection
 from estimators.errors import NisusError
 
-from ..live.jobs import Jobs, join
+from ..live.jobs import Jobs, LoopThread
 from ..live.outputs import OutputLink
 from ..present.state_message import StateMessage, state_message
 from ..twin.secrets import secrets_of
@@ -87,8 +87,8 @@ class Publisher:
         self._store = AlertStore(store, engine.twin.name, engine.notices)
         self.problem = ""
         """Why alerts are not kept, once it has started; empty if they are, or without a store."""
-        self._grown, self._stopping = threading.Event(), threading.Event()
-        self._thread = threading.Thread(target=self._run, name="outputs", daemon=True)
+        self._grown = threading.Event()
+        self._thread = LoopThread(self._run, "outputs")
 
     def start(self) -> None:
         """Connect and begin to publish."""
@@ -97,10 +97,10 @@ class Publisher:
 
     def stop(self) -> None:
         """Disconnect."""
-        self._stopping.set()
+        self._thread.stopping.set()
         self._grown.set()
         self._engine.grown -= {self._grown.set}
-        join(self._thread, 2.0)
+        self._thread.stop(2.0)
         self._end()
         self._store.close(self._parts.rules, self._parts.deliveries)
 
@@ -170,12 +170,12 @@ class Publisher:
 
     def _run(self) -> None:
         sent, at = None, -np.inf
-        while not self._stopping.is_set():
+        while not self._thread.stopping.is_set():
             self._grown.wait(ALIVE_PERIOD_S)
             self._grown.clear()
             self._follow()
             parts = self._parts
-            if self._stopping.is_set() or not parts.outputs:
+            if self._thread.stopping.is_set() or not parts.outputs:
                 continue
             section = parts.config.outputs
             message = state_message(self._engine, covariance=section.covariance)
@@ -185,7 +185,7 @@ class Publisher:
             sent, at = new, now
             for output in parts.outputs:
                 self._guarded(f"output {output.name}", partial(output.publish, message))
-            self._stopping.wait(section.every)
+            self._thread.stopping.wait(section.every)
 
     def _follow(self) -> None:
         """Begin again with the outputs of the YAML that was saved meanwhile."""

@@ -19,7 +19,7 @@ from estimators.interface.table import table_of
 from sources.worker_process import gist
 
 from ..live.history_copy import last_written
-from ..live.jobs import join
+from ..live.jobs import LoopThread
 from ..live.outputs import Pull
 from .parts import DAY_NS, GROUP_ROWS, ArchivePlan, Part, parts_of, remove_surplus
 
@@ -44,11 +44,11 @@ class Archive:
         self._begin = 0 if stored is None else stored.tail.first
         self._part: Part | None = None
         self._failed = False
-        self._stopping, self._grown = threading.Event(), threading.Event()
+        self._grown = threading.Event()
         self._stored = stored
         report = partial(engine.notices.report, counted=False)
         self._remove_surplus = partial(remove_surplus, plan.folder, plan.split, report)
-        self._thread = threading.Thread(target=self._run, name="archive", daemon=True)
+        self._thread = LoopThread(self._run, "archive")
 
     def start(self) -> None:
         """Begin to write."""
@@ -57,15 +57,15 @@ class Archive:
 
     def stop(self) -> None:
         """Write the rest of an engine that has stopped, and complete the file."""
-        self._stopping.set()
+        self._thread.stopping.set()
         self._grown.set()
         self._engine.grown -= {self._grown.set}
-        join(self._thread, 10.0)
+        self._thread.stop(10.0)
         self._engine.release(self._cursor)
 
     def _run(self) -> None:
         pause = 0.0
-        while not self._stopping.wait(pause):
+        while not self._thread.stopping.wait(pause):
             self._grown.clear()
             pause = self.look()
             self._grown.wait(IDLE_PERIOD_S)

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import threading
 import time
 from collections.abc import Sequence
 from pathlib import Path
@@ -12,7 +11,7 @@ from config.fleet_schema import FleetAlertSection
 from estimators.fleet.table import FleetTable
 from estimators.track import HEALTH_NAMES
 
-from ..live.jobs import Jobs, join
+from ..live.jobs import Jobs, LoopThread
 from ..live.notices import Notices
 from ..present.fleet_state import ChangedAssets, asset_message
 from ..terminal import print_line
@@ -64,8 +63,7 @@ class FleetPublisher:
         self._rules = FleetRules(rules or (HEALTH_RULE,), plan.name, link=page)
         self._store = AlertStore(store, plan.name, self.notices)
         self._jobs = Jobs(self.notices, "output", threads=max(1, len(self._deliveries.queues)), niceness=0)
-        self._stopping = threading.Event()
-        self._thread = threading.Thread(target=self._run, name="outputs", daemon=True)
+        self._thread = LoopThread(self._run, "outputs")
 
     def start(self) -> None:
         """Connect and begin to publish."""
@@ -81,8 +79,7 @@ class FleetPublisher:
 
     def stop(self) -> None:
         """Disconnect."""
-        self._stopping.set()
-        join(self._thread, 2.0)
+        self._thread.stop(2.0)
         self._jobs.stop()
         self._store.close(self._rules, self._deliveries)
         if self._mqtt is not None:
@@ -91,7 +88,7 @@ class FleetPublisher:
 
     def _run(self) -> None:
         due = time.monotonic()
-        while not self._stopping.wait(max(0.0, due - time.monotonic())):
+        while not self._thread.stopping.wait(max(0.0, due - time.monotonic())):
             due = time.monotonic() + self._section.every
             try:
                 _, names, table = self._fleet.table()
@@ -109,13 +106,13 @@ class FleetPublisher:
         if mqtt.connections != self._connections:  # what was on its way is lost, and the broker may have none
             self._changed, self._connections = ChangedAssets(), mqtt.connections
         self._changed.look(table)
-        while mqtt.link().connected and not self._stopping.is_set():
+        while mqtt.link().connected and not self._thread.stopping.is_set():
             places = self._changed.take(room := mqtt.room)
             for place in places:
                 mqtt.publish(asset_message(self._fleet.plan.twin, names[place], table, place))
             if (room and len(places) < room) or time.monotonic() >= due:
                 return
-            self._stopping.wait(POLL_S)
+            self._thread.stopping.wait(POLL_S)
 
     def _alert(self, names: Sequence[str], table: FleetTable) -> None:
         """Put the alerts that are due into the queues of their receivers."""

@@ -22,7 +22,7 @@ from estimators.events.batch import KIND_NAMES, READING, Events
 from sources.source import Report
 from sources.worker_process import gist
 
-from ..live.jobs import join
+from ..live.jobs import LoopThread
 from .archive_journal import JOURNAL, Journal, complete_journal, complete_journals, read_journal
 from .parts import DAY_NS, ArchivePlan, number_of, parts_of, remove_surplus
 
@@ -70,8 +70,7 @@ class FleetArchive:
         self._ended: list[Path] = []
         """Journals that become Parquet files."""
         self._begun = self._failed = False
-        self._stopping = threading.Event()
-        self._thread = threading.Thread(target=self._run, name="archive", daemon=True)
+        self._thread = LoopThread(self._run, "archive")
 
     def put(self, at: np.ndarray, events: Events) -> None:
         """Add events of the assets at the positions `at` (N,); from the thread that folds."""
@@ -92,12 +91,11 @@ class FleetArchive:
 
     def stop(self) -> None:
         """Write the rest, and complete the file."""
-        self._stopping.set()
-        join(self._thread, 10.0)
+        self._thread.stop(10.0)
 
     def _run(self) -> None:
         pause = 0.0
-        while not self._stopping.wait(pause):
+        while not self._thread.stopping.wait(pause):
             pause = self.look()
         self.look(closing=True)
 

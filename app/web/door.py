@@ -35,7 +35,7 @@ from uvicorn.protocols.http.h11_impl import H11Protocol
 
 from estimators.errors import ConfigError
 
-from ..live.jobs import join
+from ..live.jobs import LoopThread
 from .gate import SESSION, USER, Gate, Grant, User, changes, with_security_headers
 from .http import MAX_BODY_BYTES
 
@@ -245,9 +245,7 @@ class Door:
             http=BoundedProtocol, backlog=BACKLOG,
         )  # fmt: skip
         self._server = PageServer(config)
-        self._thread = threading.Thread(
-            target=self._server.run, kwargs={"sockets": self.sockets}, name="page server", daemon=True
-        )
+        self._thread = LoopThread(functools.partial(self._server.run, sockets=self.sockets), "page server")
 
     @property
     def url(self) -> str:
@@ -306,7 +304,7 @@ class Door:
     def stop(self) -> None:
         """Close all connections, and the port."""
         self._server.end()
-        join(self._thread, 5.0)
+        self._thread.stop(5.0)
         for listener in self.sockets:
             listener.close()
 

@@ -16,7 +16,7 @@ from typing import Any
 
 from estimators.track import HEALTH_NAMES
 
-from ..live.jobs import join
+from ..live.jobs import LoopThread
 from ..terminal import print_line
 
 STARTING, RUNNING, STOPPED, FAILED = "starting", "running", "stopped", "failed"
@@ -151,13 +151,12 @@ class Supervisor:
         self.changing = threading.RLock()
         """Held while the twins are changed."""
         self._child, self._folder, self._at_once, self._on_demand = child, folder, at_once, on_demand
-        self._stopping = threading.Event()
         self._looked = time.monotonic()
         methods = multiprocessing.get_all_start_methods()
         self._context: Any = multiprocessing.get_context("forkserver" if "forkserver" in methods else "spawn")
         if preload and "forkserver" in methods:
             self._context.set_forkserver_preload(list(preload))
-        self._thread = threading.Thread(target=self._watch, name="service", daemon=True)
+        self._thread = LoopThread(self._watch, "service")
 
     # From any thread
 
@@ -170,8 +169,7 @@ class Supervisor:
 
     def stop(self) -> None:
         """Stop all processes, concurrently."""
-        self._stopping.set()
-        join(self._thread, 5.0)
+        self._thread.stop(5.0)
         for twin in self.twins.values():
             self.ask_to_stop(twin)
         end = time.monotonic() + STOP_TIMEOUT_S
@@ -194,7 +192,7 @@ class Supervisor:
     # In the supervisor's thread
 
     def _watch(self) -> None:
-        while not self._stopping.is_set():
+        while not self._thread.stopping.is_set():
             twins = list(self.twins.values())
             pipes: dict[Any, ServedTwin] = {twin.pipe: twin for twin in twins if twin.pipe is not None}
             waited: list[Any] = [*pipes, *(twin.process.sentinel for twin in twins if twin.process is not None)]
@@ -204,7 +202,7 @@ class Supervisor:
                 self._look()
 
     def _rest(self) -> set[Any]:
-        self._stopping.wait(0.2)
+        self._thread.stopping.wait(0.2)
         return set()
 
     def _listen(self, twin: ServedTwin) -> None:

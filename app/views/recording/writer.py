@@ -21,7 +21,7 @@ from estimators.errors import NisusError, SourceError
 from sources.worker_process import gist
 
 from ...format_time import counted
-from ...live.jobs import join
+from ...live.jobs import LoopThread
 from ...live.notices import Notice
 from ...live.outputs import Cursor, Pull
 from .rrd_file import DATE, NEVER, Disk, Split, part_path, surplus_parts
@@ -62,13 +62,12 @@ class Recorder:
         self._wanted: Path | None = None
         self._asked: deque[Path | None] = deque()
         self._taken: Path | None = None
-        self._stopping = False
         self._open: RecordingPart | None = None
         self._closed = False
         """Whether a closed stream still has threads."""
         self.finished: list[Path] = []
         self.failure = ""
-        self._thread = threading.Thread(target=self._run, name="recorder", daemon=True)
+        self._thread = LoopThread(self._run, "recorder")
 
     @property
     def path(self) -> Path | None:
@@ -105,9 +104,9 @@ class Recorder:
 
     def stop(self) -> None:
         """Finish the file and end the thread."""
-        self._stopping = True
+        self._thread.stopping.set()
         self.record(None)
-        join(self._thread, 10.0)
+        self._thread.stop(10.0)
 
     def _run(self) -> None:
         while True:
@@ -138,7 +137,7 @@ class Recorder:
                 free_closed_streams()
             if self._asked:
                 continue
-            if self._stopping and self._open is None:
+            if self._thread.stopping.is_set() and self._open is None:
                 return
             self._wake.wait(LOG_PERIOD_S if self._open is not None else None)
             self._wake.clear()

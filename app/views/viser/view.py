@@ -11,7 +11,7 @@ from urllib.parse import parse_qs
 
 from estimators.diagnostics.references import shown_track
 
-from ...live.jobs import join
+from ...live.jobs import LoopThread
 from ...live.running_fold import Running
 from ...present.drawing.colors import THEMES
 from .guarded_server import addresses, guarded_server, unprinted, when_connected
@@ -54,10 +54,10 @@ class ViserView:
         self._past: tuple[int, int] | None = None
         """Last event of the past that the history has, and its revision; None while it follows the newest row."""
         self._tuning, self._turned, self._drawn = engine.tuning, -EDIT_REST_S, -MAX_EDIT_WAIT_S
-        self._stop, self._come = False, threading.Event()
-        """The second is set when a browser connects, or to stop."""
+        self._come = threading.Event()
+        """Set when a browser connects, or to stop."""
         when_connected(self.server, self._come.set)
-        self._thread = threading.Thread(target=self._run, name="viser view", daemon=True)
+        self._thread = LoopThread(self._run, "viser view")
 
     def start(self) -> None:
         """Start drawing."""
@@ -65,9 +65,9 @@ class ViserView:
 
     def stop(self) -> None:
         """Stop drawing and the server."""
-        self._stop = True
+        self._thread.stopping.set()
         self._come.set()
-        join(self._thread, 30.0)
+        self._thread.stop(30.0)
         self._rest()
         with unprinted():
             self.server.stop()
@@ -138,7 +138,7 @@ class ViserView:
         while True:
             self._come.clear()
             there = addresses(self.server)
-            if self._stop:
+            if self._thread.stopping.is_set():
                 return
             if not there:
                 self._rest()

@@ -15,7 +15,7 @@ from config.tunings import OWN_VALUES
 from estimators.errors import ConfigError, NisusError, nearest, quoted
 
 from ...live.changes import obstacle
-from ...live.jobs import join
+from ...live.jobs import LoopThread
 from ...twin.twin import VERSION, Twin, with_version
 from ..running import OpenedTwin, RunningTwin, Stamp, stamp_of
 from ..session import Session
@@ -184,8 +184,7 @@ class SavedFiles:
         self._files: tuple[Path, ...] = ()
         self._known: Stamp = ()
         self._seen: Stamp = ()
-        self._stopping = threading.Event()
-        self._thread = threading.Thread(target=self._run, name="saved files", daemon=True)
+        self._thread = LoopThread(self._run, "saved files")
 
     def start(self) -> None:
         """Begin."""
@@ -193,8 +192,7 @@ class SavedFiles:
 
     def stop(self) -> None:
         """End."""
-        self._stopping.set()
-        join(self._thread, 2.0)
+        self._thread.stop(2.0)
 
     def look(self) -> None:
         """Look once; reload when a file has changed since it was read, but not since the last look."""
@@ -250,7 +248,7 @@ class SavedFiles:
         running.engine.notices.say(f"not read again: {text}", level="error")
 
     def _run(self) -> None:
-        while not self._stopping.wait(FILE_POLL_PERIOD_S):
+        while not self._thread.stopping.wait(FILE_POLL_PERIOD_S):
             try:
                 self.look()
             except NisusError as error:
