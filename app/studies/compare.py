@@ -107,8 +107,7 @@ def timed(
 
     The fold comes with the shortest time an event, s of one processor.
     """
-    log = Log.of(twin.model, capacity=max(1, len(events)))
-    log.extend(events)
+    log = Log.resume(twin.model, None, events)
     tuning = replace(twin.tuning.with_options(twin.options_of(estimator)), seed=seed)
     fold = Fold(estimator, twin.model, tuning, log, pairs=twin.pairs, policy=twin.policy, expected=twin.expected)
     took: list[float] = []

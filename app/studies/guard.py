@@ -225,8 +225,7 @@ def logs_of(guarded: GuardedLog, twin: Twin, span: float | None) -> Iterator[tup
         from ..views.recording.reader import read_recording
 
         recorded = read_recording(guarded.recording)
-        log = Log.of(twin.model, capacity=max(1, recorded.rows))
-        log.extend(recorded.events)
+        log = Log.resume(twin.model, None, recorded.events)
         if span is not None and log.n:
             log.n = int(np.searchsorted(log.t[: log.n], log.t[0] + round(span * 1e9), side="right"))
         yield log, recorded.base_for(twin.model)[0]
@@ -375,15 +374,7 @@ def guard_json(found: Sequence[GuardVerdict]) -> list[dict[str, Any]]:
             "failure": each.failure,
             "missing": each.absent,
             "figures": [
-                {
-                    "figure": one.figure,
-                    "log": one.log,
-                    "before": one.before,
-                    "now": one.now,
-                    "change": one.change,
-                    "allowed": one.allowed,
-                    "verdict": "worse" if one.worse else "better" if one.better else "same",
-                }
+                {**one._asdict(), "verdict": "worse" if one.worse else "better" if one.better else "same"}
                 for one in each.compared
             ],
         }

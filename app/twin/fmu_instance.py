@@ -122,12 +122,10 @@ class Fmu:
         u, p = np.array(self.default_u), np.array(self.default_p)
         with self._lock, self._blamed("fails at its start values"):
             self._prepare(u, p)
-            self._fmu.getContinuousStates(self._x_at, self._x.size)
-            start = self._x.copy()
+            start = self._present().copy()
             moved = start + 0.01 * (1.0 + np.abs(start))
             self._place(moved, u)
-            self._fmu.getContinuousStates(self._x_at, self._x.size)
-            if not self._indicators and not np.array_equal(self._x, moved):
+            if not np.array_equal(self._present(), moved) and not self._indicators:
                 raise ModelError(f"{self._name}: setContinuousStates has no effect; a filter must set its states")
             now = self._rates_at(start)
             if not np.all(np.isfinite(now)):
@@ -246,11 +244,18 @@ class Fmu:
             self._fmu.setFMUState(self._kept)
             if self._inputs:
                 self._set(self._inputs, u.tolist())
-        self._x[:] = x
-        self._fmu.setContinuousStates(self._x_at, self._x.size)
+        self._put(x)
         if self._indicators:
             self._fmu.enterEventMode()
             self._settle()
+
+    def _put(self, x: np.ndarray) -> None:
+        self._x[:] = x
+        self._fmu.setContinuousStates(self._x_at, self._x.size)
+
+    def _present(self) -> np.ndarray:
+        self._fmu.getContinuousStates(self._x_at, self._x.size)
+        return self._x
 
     def _rates(self) -> np.ndarray:
         self._derivatives(self._rate_at, self._rate.size)
@@ -258,19 +263,15 @@ class Fmu:
 
     def _rates_at(self, x: np.ndarray) -> np.ndarray:
         """Return the rates at a state in the present mode, without events."""
-        self._x[:] = x
-        self._fmu.setContinuousStates(self._x_at, self._x.size)
+        self._put(x)
         return self._rates().copy()
 
     def _through_events(self, dt: float) -> np.ndarray:
         """Step from where the instance is, with the relations of its mode, and handle the events at the end."""
-        self._fmu.getContinuousStates(self._x_at, self._x.size)
-        self._x[:] = _rk4(self._rates_at, self._x.copy(), dt)
-        self._fmu.setContinuousStates(self._x_at, self._x.size)
+        self._put(_rk4(self._rates_at, self._present().copy(), dt))
         self._fmu.enterEventMode()
         self._settle()
-        self._fmu.getContinuousStates(self._x_at, self._x.size)
-        return self._x
+        return self._present()
 
 
 def _free(fmu: Any, folder: tempfile.TemporaryDirectory) -> None:

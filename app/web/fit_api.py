@@ -173,7 +173,8 @@ class Advising:
         self._engine = engine
         self._job: Job | None = None
         self._progress: AdviceProgress | None = None
-        self._last: dict[str, Any] = {}
+        self.advice: dict[str, Any] = {}
+        """The last advice as JSON; a cancelled one leaves the one before."""
         self.revision: int | None = None
 
     @property
@@ -185,11 +186,6 @@ class Advising:
     def reason(self) -> str:
         """Why it failed."""
         return "" if self._job is None else self._job.reason
-
-    @property
-    def advice(self) -> dict[str, Any]:
-        """The last advice as JSON; a cancelled one leaves the one before."""
-        return self._last
 
     def progress(self) -> dict[str, Any]:
         """Return the question that is being answered, the share done, and the seconds spent and left, about."""
@@ -239,5 +235,5 @@ class Advising:
         twin = replace(engine.twin, tuning=tuning, estimator=estimator)
         clean, excluded = without_faults(twin, log, engine.episodes())
         found = advice_json(twin, log, advise(Measured(twin, clean, excluded, self._progress)))
-        self._last, self.revision = found, revision
+        self.advice, self.revision = found, revision
         return found

@@ -274,13 +274,14 @@ class Supervisor:
         while twin.pipe is not None and twin.pipe.poll():
             self._listen(twin)
         ran, code = time.monotonic() - twin.began, twin.process.exitcode or 0
+        why = twin.text or (f"ended by {_signal_name(-code)}" if code < 0 else f"ended with status {code}")
         twin.process.close()
         if twin.pipe is not None:
             twin.pipe.close()
         twin.process, twin.pipe, twin.port, twin.report = None, None, 0, {}
         if self._on_demand:
             twin.state = FAILED if twin.wanted else STOPPED
-            twin.text = twin.text or (f"ended by {_signal_name(-code)}" if code < 0 else f"ended with status {code}")
+            twin.text = why
             del self.twins[twin.name]
             return
         if not twin.wanted:
@@ -291,7 +292,6 @@ class Supervisor:
             twin.state, twin.wait = STARTING, FIRST_RETRY_S
             print_line("info", "stopped, to be started anew", twin=twin.name)
             return
-        why = twin.text or (f"ended by {_signal_name(-code)}" if code < 0 else f"ended with status {code}")
         twin.wait = FIRST_RETRY_S if ran > STEADY_S else twin.wait
         twin.due = time.monotonic() + twin.wait
         if why != twin.failure or ran > STEADY_S:  # one that cannot start at all is one line

@@ -371,6 +371,12 @@ class StateSpaceModel:
         """The states of the track's columns, in order."""
         return tuple(self.states[int(j)] for j in self.shown)
 
+    @property
+    def units(self) -> dict[str, str]:
+        """Units of the shown states and the inputs, by name."""
+        units = {state.name: state.unit for state in self.shown_states}
+        return units | {item.name: item.unit for item in self.inputs}
+
     def acts_on(self, noise: str) -> range:
         """Return the states to which a noise of that name adds: one, a whole field, or none."""
         if isinstance(self.states, Field):

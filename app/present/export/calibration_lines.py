@@ -49,8 +49,7 @@ def coverage_rows(found: Sequence[CoverageBin], model: StateSpaceModel) -> list[
 
     Of more than `MAX_COVERAGE_ROWS` those with the lowest coverage.
     """
-    units = {state.name: state.unit for state in model.shown_states} | {item.name: item.unit for item in model.inputs}
-    units[TIME] = "s"
+    units = model.units | {TIME: "s"}
     begun = min((item.low for item in found if item.by == TIME), default=0.0)
     found = [item._replace(low=item.low - begun, high=item.high - begun) if item.by == TIME else item for item in found]
     rows = []

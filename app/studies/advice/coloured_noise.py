@@ -193,8 +193,7 @@ def _tried(
     for key in _keys(larger, best.appended):
         if key in best.tuning.keys():  # noqa: SIM118  a method of a tuning
             tuning = tuning.set(key, best.tuning.get(key))
-    whole = Log.of(larger, capacity=max(1, log.n))
-    whole.extend(log.events)
+    whole = Log.resume(larger, None, log.events)
     try:
         entries, _ = entries_of(estimator, tuning, [whole], _keys(larger, (one,)))
         recording = Recording(whole, 1.0, np.zeros(whole.n, bool))

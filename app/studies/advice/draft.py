@@ -290,7 +290,7 @@ def yaml_text(
             what = "the rate of " if reads.rate else ""
             unit = reads.signal.series.unit or "1"
             sensors.append(f"  {reads.name}: {{{fields}}}  # {_line(unit)}; measures {what}{item.name}")
-    read = [reads for item in drafted.states for reads in item.sensors]
+    read = drafted.sensors
     source = _source(drafted, found, databases, folder)
     first = next((f"[{item.name}, {item.second}]" for item in drafted.states if item.smooth), None)
     if first is None and len(drafted.states) > 1:
@@ -336,7 +336,7 @@ def _source(
     drafted: DraftPlan, found: RecordingContents, databases: Sequence[tuple[Path, BusName]], folder: Path
 ) -> list[str]:
     """Return the lines of the source: one recording, or a part for each that feeds a sensor or input."""
-    read = [reads for item in drafted.states for reads in item.sensors]
+    read = drafted.sensors
     families = _families(drafted)
 
     def of(part: RecordingContents, k: int) -> list[str]:
@@ -394,7 +394,7 @@ class Family(NamedTuple):
 def _families(drafted: DraftPlan) -> dict[str, Family]:
     """Return the family of each sensor that has one."""
     groups: dict[tuple[int, str], list[Reads]] = {}
-    for reads in (reads for item in drafted.states for reads in item.sensors):
+    for reads in drafted.sensors:
         if reads.signal.series.only is not None:
             groups.setdefault((reads.signal.part, reads.signal.series.column), []).append(reads)
     found: dict[str, Family] = {}
@@ -454,7 +454,7 @@ def _comments(drafted: DraftPlan, name: str) -> list[str]:
 
 def hint_lines(drafted: DraftPlan) -> list[str]:
     """Return what the draft does not use of its signals, with the next step, a line each."""
-    sensors = [reads.signal for item in drafted.states for reads in item.sensors]
+    sensors = [reads.signal for reads in drafted.sensors]
     lines = [
         f"{_line(one.name)}: {one.repeats.reason}"
         + f"; the draft has repeats: {one.repeats.key}" * bool(one.repeats.key)

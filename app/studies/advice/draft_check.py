@@ -68,7 +68,7 @@ ALTERNATE_PARTS = 8  # Parts of a recording whose halves differ
 
 def split_of(drafted: DraftPlan, parts: int = 2) -> Split:
     """Return an even number of parts with as many readings of the sensors each."""
-    times = np.concatenate([reads.signal.series.t for item in drafted.states for reads in item.sensors])
+    times = np.concatenate([reads.signal.series.t for reads in drafted.sensors])
     return Split(tuple(int(np.quantile(times, k / parts)) for k in range(1, parts)))
 
 
@@ -123,7 +123,7 @@ class DraftFold:
 
     def __init__(self, drafted: DraftPlan, model: StateSpaceModel, split: Split, *, fitted_only: bool = False) -> None:
         self.drafted, self.model = drafted, model
-        self._sensors = [reads for item in drafted.states for reads in item.sensors]
+        self._sensors = drafted.sensors
         zero = min(int(reads.signal.series.t[0]) for reads in self._sensors)
         self._zero, self._split = zero, split
         noises = {item.second if item.smooth else item.name: rounded(item.over) for item in drafted.states if item.over}

@@ -253,7 +253,7 @@ def fit_plan(drafted: DraftPlan, progress: FitProgress | None = None) -> Iterato
 
 def _fit_split(drafted: DraftPlan, split: Split, progress: FitProgress) -> Generator[FitStep, None, DraftPlan]:
     """Yield the steps of fitting a draft to some parts of its recording; return the plan, checked on the others."""
-    t = np.concatenate([reads.signal.series.t for item in drafted.states for reads in item.sensors])
+    t = np.concatenate([reads.signal.series.t for reads in drafted.sensors])
     span = float(t.max() - t.min()) * 1e-9
     drafted = replace(drafted, states=tuple(_scaled_on(item, split) for item in drafted.states))
     with tempfile.TemporaryDirectory() as name:

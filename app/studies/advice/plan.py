@@ -183,6 +183,11 @@ class DraftPlan:
     options: Mapping[str, str | float] = field(default_factory=dict)
     check: DraftCheck | None = None
 
+    @property
+    def sensors(self) -> list[Reads]:
+        """Sensors of all states."""
+        return [reads for item in self.states for reads in item.sensors]
+
 
 def plan(found: RecordingContents, roles: Roles) -> DraftPlan:
     """Return a draft in which every signal has the role that it was given, or one that the data suggest.

@@ -59,7 +59,7 @@ def rows_json(
     found = calibrations(model, events, track, gate=tuning.gate, marginal=marginal) if len(events) else []
     known = {item.subject: item for item in found}
     bins = coverage_bins(model, events, track, held_inputs(model, events), marginal=marginal, most=COVERED)
-    units = {state.name: state.unit for state in model.shown_states} | {item.name: item.unit for item in model.inputs}
+    units = model.units
     rows = dict(zip(model.row_names, () if tuning.baseline is None else tuning.baseline, strict=False))
     said = []
     for name, s, k in rows_of(model)[:MAX_ROWS]:

@@ -252,8 +252,7 @@ class Bench:
         log = Log.of(twin.model, capacity=max(1, len(events)))
         _, stale = log.extend(events, round(twin.config.time.horizon * 1e9))
         truth = log.events.select(slice(None))
-        untold = Log.of(twin.model, capacity=max(1, len(truth)))
-        untold.extend(without_truth(truth))
+        untold = Log.resume(twin.model, None, without_truth(truth))
         return StressFold(self._folded(estimator, tuning, untold, None, prior), truth, stale)
 
     def _folded(

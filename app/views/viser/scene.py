@@ -66,19 +66,25 @@ SQUARE = np.array([[-1, -1], [1, -1], [1, 1], [-1, 1], [-1, -1]], float)
 """Corners (5, 2) of the square from -1 to 1, once around."""
 
 
-def disc(sides: int = 64) -> tuple[np.ndarray, np.ndarray]:
+SIDES = 64  # Sides of a disc
+
+
+def disc() -> tuple[np.ndarray, np.ndarray]:
     """Return vertices and triangles of a flat disc of radius 1 in the plane z = 0."""
-    angle = np.linspace(0, 2 * np.pi, sides, endpoint=False)
-    rim = np.stack((np.cos(angle), np.sin(angle), np.zeros(sides)), axis=1)
-    k = np.arange(sides)
-    faces = np.stack((np.full(sides, sides), k, (k + 1) % sides), axis=1)
+    k = np.arange(SIDES)
+    faces = np.stack((np.full(SIDES, SIDES), k, (k + 1) % SIDES), axis=1)
+    rim = on_circle(np.linspace(0, 2 * np.pi, SIDES, endpoint=False))
     return np.vstack((rim, np.zeros(3))).astype(np.float32), faces.astype(np.uint32)
 
 
-def circle(sides: int = 64) -> np.ndarray:
-    """Return the rim of that disc as segments (sides, 2, 3)."""
-    angle = np.linspace(0, 2 * np.pi, sides + 1)
-    return segments(np.stack((np.cos(angle), np.sin(angle), np.zeros(sides + 1)), axis=1))
+def circle() -> np.ndarray:
+    """Return the rim of that disc as segments (SIDES, 2, 3)."""
+    return segments(on_circle(np.linspace(0, 2 * np.pi, SIDES + 1)))
+
+
+def on_circle(angle: np.ndarray) -> np.ndarray:
+    """Return the points (n, 3) of the circle of radius 1 in the plane z = 0 at some angles."""
+    return np.stack((np.cos(angle), np.sin(angle), np.zeros(angle.size)), axis=1)
 
 
 NO_LINE, NO_POINT = np.zeros((1, 2, 3), np.float32), np.zeros((1, 3), np.float32)

@@ -20,7 +20,19 @@ from estimators.tuning import Tuning
 from ...live.outputs import Belief
 from ...present.drawing.colors import Palette, mixed, round_step
 from ...present.drawing.direct_readings import expected, observed
-from .scene import History, Outlook, PeakMarks, Shapes, about_z, circle, disc, ellipsoid, put_points, segments
+from .scene import (
+    History,
+    Outlook,
+    PeakMarks,
+    Shapes,
+    about_z,
+    circle,
+    disc,
+    ellipsoid,
+    on_circle,
+    put_points,
+    segments,
+)
 
 MAX_TRAIL_SPREAD = 20.0
 """Multiple of the median deviation above which a position is left out of the trail."""
@@ -327,9 +339,8 @@ class Beacons:
         self._entries = beacon_entries(model, beacons.values())
         nowhere = np.zeros((len(beacons), 3), np.float32)
         self._marks = shapes.dots("places", palette.ink, size, nowhere, shape="diamond")
-        angle = np.linspace(-RANGE_ARC, RANGE_ARC, ARC_SIDES)
-        arc = segments(np.stack((np.cos(angle), np.sin(angle), np.zeros(ARC_SIDES)), axis=1))
-        self._arcs = [shapes.lines(f"{sensor}/arc", palette.reading, 2, arc, visible=False) for sensor in beacons]
+        line = segments(on_circle(np.linspace(-RANGE_ARC, RANGE_ARC, ARC_SIDES)))
+        self._arcs = [shapes.lines(f"{sensor}/arc", palette.reading, 2, line, visible=False) for sensor in beacons]
         self._texts = [
             shapes.label(f"{sensor}/name", sensor.replace("_", " "), anchor="bottom-center") for sensor in beacons
         ]
