@@ -42,6 +42,11 @@ def printable(text: str) -> str:
     return "".join(c if c.isprintable() or c == "\n" else c.encode("unicode_escape").decode() for c in text)
 
 
+def reason_of(error: BaseException) -> str:
+    """Return the message of an error; of one that is not of Nisus, its type too."""
+    return str(error) if isinstance(error, NisusError) else f"{type(error).__name__}: {error}"
+
+
 def quoted(text: str) -> str:
     """A text from a file as a message shows it: shortened, in quotes, with unprintable characters escaped."""
     return repr(text if len(text) <= MAX_QUOTED_CHARACTERS else text[: MAX_QUOTED_CHARACTERS - 3] + "...")

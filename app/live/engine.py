@@ -19,7 +19,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from estimators.diagnostics.references import own_grades
-from estimators.errors import NisusError
+from estimators.errors import NisusError, reason_of
 from estimators.late import inflated
 from estimators.log import INPUT, READING, TICK, Events
 from estimators.registry import find_estimator
@@ -340,10 +340,8 @@ class Engine(Running):
                 self._round(min(0.05, self._tick))
                 for tell in self.grown:
                     tell()
-            except NisusError as error:
-                self.notices.report("engine error", str(error), level="error")
             except (Exception, SystemExit) as error:  # noqa: BLE001  no input of a user or sensor may stop the twin
-                self.notices.report("engine error", f"{type(error).__name__}: {error}", level="error")
+                self.notices.report("engine error", reason_of(error), level="error")
 
     def _round(self, timeout: float) -> None:
         """Wait for an item, then handle all that are in the inbox."""

@@ -7,7 +7,7 @@ import threading
 from collections.abc import Callable
 from typing import TYPE_CHECKING, Any, NamedTuple
 
-from estimators.errors import NisusError
+from estimators.errors import reason_of
 from sources.source import controls_of
 
 from .jobs import LoopThread
@@ -126,7 +126,7 @@ class Feeder:
                     self._inbox.put(self._finished)
                 wait = 0.1
             except Exception as error:  # noqa: BLE001  whatever a driver raises, the twin goes on
-                text = str(error) if isinstance(error, NisusError) else f"{type(error).__name__}: {error}"
+                text = reason_of(error)
                 self._report("source failed", f"source failed: {text}")
                 if not self.live:
                     self._inbox.put(self._finished)

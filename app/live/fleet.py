@@ -16,7 +16,7 @@ from typing import TYPE_CHECKING, Any, NamedTuple, Protocol
 
 import numpy as np
 
-from estimators.errors import NisusError, SourceError, is_blank, quoted
+from estimators.errors import SourceError, is_blank, quoted, reason_of
 from estimators.events.clocks import ClockGuard
 from estimators.fleet.table import FleetTable
 from estimators.log import BEFORE, READING, Events
@@ -228,7 +228,7 @@ class RunningFleet:
         try:
             self.run(lambda: not self._thread.stopping.is_set())
         except Exception as error:  # noqa: BLE001  the overview stays, and says why nothing is folded any more
-            self.failure = str(error) if isinstance(error, NisusError) else f"{type(error).__name__}: {error}"
+            self.failure = reason_of(error)
             self.note(STOPPED, f"the fleet stands still: {self.failure}")
             self.source.close()  # senders and brokers keep what would not be folded
 

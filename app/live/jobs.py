@@ -16,7 +16,7 @@ from collections.abc import Callable, Iterator
 from concurrent.futures import Executor, Future, wait
 from typing import Any
 
-from estimators.errors import NisusError
+from estimators.errors import reason_of
 
 from .notices import Notices
 
@@ -106,10 +106,8 @@ class Job:
             answer = self.work(self)
         except JobCancelled:
             state = CANCELLED
-        except NisusError as error:
-            state, reason = FAILED, str(error)
         except (Exception, SystemExit) as error:  # noqa: BLE001  a user's model may raise anything; the twin goes on
-            state, reason = FAILED, f"{type(error).__name__}: {error}"
+            state, reason = FAILED, reason_of(error)
         if state == FAILED:
             self.failed(reason)
         if self.every is not None and state != CANCELLED and not self.cancelled:

@@ -24,7 +24,7 @@ import numpy as np
 
 from config.tunings import OWN_VALUES
 from estimators.diagnostics.episodes import Episode, TrackedEpisode
-from estimators.errors import NisusError, SourceError
+from estimators.errors import NisusError, SourceError, reason_of
 from estimators.fold_checks import check_base
 from estimators.log import Events, Log
 from sources.source import Marked
@@ -329,7 +329,7 @@ def read_store(store: Store, twin: Twin) -> StoredTwin | None:
     try:
         return _stored_twin(parts, rows, commands, twin)
     except Exception as error:  # noqa: BLE001  a file may hold anything; the twin runs without it
-        reason = str(error) if isinstance(error, NisusError) else f"{type(error).__name__}: {error}"
+        reason = reason_of(error)
         remedy = "remove it, or choose another path"
         raise SourceError(f"store {store.path}: cannot be continued ({reason}); {remedy}") from None
 
@@ -499,7 +499,7 @@ class StoreWriter:
             self._cursor.log = -1
             self._written.clear()
             self._failed = True
-            reason = str(error) if isinstance(error, NisusError) else f"{type(error).__name__}: {error}"
+            reason = reason_of(error)
             text = f"{reason}; the twin goes on without it, and tries again"
             self._engine.notices.report("store", text, level="error", counted=False)
             return RETRY_PERIOD_S
