@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import re
+from collections.abc import Iterable
 from dataclasses import replace
 from typing import TYPE_CHECKING, Any
 
@@ -29,7 +30,8 @@ MAX_REGISTERS = 65_536
 MessageSection = PushSection | MqttSourceSection | OpcUaSourceSection | ModbusSourceSection
 
 
-def _messages(opening: Opening) -> Messages:
+def _messages(opening: Opening, key: str = "", named: Iterable[str] = ()) -> Messages:
+    """Return the values of a source; refuse those `named` under `key` that feed nothing."""
     from sources.messages import Messages
 
     if not opening.live:
@@ -37,18 +39,21 @@ def _messages(opening: Opening) -> Messages:
             "has no recording; record a session (`nisus run TWIN --record FILE.rrd`) and give its file to the command"
         )
         raise failure(opening.loaded, opening.key, text)
-    named = replace(opening, section=with_channels(opening.section, opening.model))
+    section = replace(opening, section=with_channels(opening.section, opening.model))
     width, report = opening.model.width, opening.report
     assets = isinstance(opening.section, FleetPushSection | FleetMqttSection)
-    return blamed(named, lambda channels: Messages(channels, width=width, report=report, assets=assets))
+    messages = blamed(section, lambda channels: Messages(channels, width=width, report=report, assets=assets))
+    for name in sorted(set(named) - set(messages.names)):
+        text = f"names {name!r}, no value of this twin; {nearest(name, messages.names)}"
+        raise failure(opening.loaded, (*opening.key, key), text)
+    return messages
 
 
 def _open_mqtt(opening: Opening) -> Source:
     from sources.brokers import SHARED, MqttSource, TopicMap
 
     section: MqttSourceSection = opening.section
-    messages = _messages(opening)
-    _check_names(opening, messages, {name for topic in section.topics.values() for name in topic.values}, "topics")
+    messages = _messages(opening, "topics", (name for topic in section.topics.values() for name in topic.values))
     topics: dict[str, TopicMap] = {}
     subscribed: list[str] = []
     by_hand = opening.stored and section.client_id is not None and section.qos > 0
@@ -100,8 +105,7 @@ def _open_opcua(opening: Opening) -> Source:
     from sources.brokers import OpcUaSource
 
     section: OpcUaSourceSection = opening.section
-    messages = _messages(opening)
-    _check_names(opening, messages, set(section.nodes), "nodes")
+    messages = _messages(opening, "nodes", section.nodes)
     return OpcUaSource(messages, section.url, section.nodes, period=section.every, report=opening.report)
 
 
@@ -109,8 +113,7 @@ def _open_modbus(opening: Opening) -> Source:
     from sources.modbus import ModbusSource, Register
 
     section: ModbusSourceSection = opening.section
-    messages = _messages(opening)
-    _check_names(opening, messages, set(section.registers), "registers")
+    messages = _messages(opening, "registers", section.registers)
     registers = {name: Register(**item.model_dump()) for name, item in section.registers.items()}
     for name, item in registers.items():
         last = MAX_REGISTERS - item.size
@@ -126,13 +129,6 @@ def _open_modbus(opening: Opening) -> Source:
         period=section.every,
         report=opening.report,
     )
-
-
-def _check_names(opening: Opening, messages: Messages, named: set[str], key: str) -> None:
-    """Refuse names of values that feed nothing."""
-    for name in sorted(named - set(messages.names)):
-        text = f"names {name!r}, no value of this twin; {nearest(name, messages.names)}"
-        raise failure(opening.loaded, (*opening.key, key), text)
 
 
 def with_channels(section: MessageSection, model: StateSpaceModel) -> MessageSection:
