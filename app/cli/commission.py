@@ -4,6 +4,8 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING
 
+from estimators.diagnostics.calibration import WHOLE
+from estimators.diagnostics.detector_tests import COVERED
 from estimators.diagnostics.episodes import episodes
 from estimators.track import HEALTH_NAMES, STALE
 
@@ -12,6 +14,7 @@ from ..live.tunings.versions import write_section
 from ..live.watchdog import interruptible
 from ..present.result import to_json
 from ..studies.commission import baseline_of, lines, section_file
+from ..studies.fold_result import coverage_of
 from ..terminal import complain
 from ..twin.log_reader import read_log
 from ..twin.twin import load_twin
@@ -37,6 +40,12 @@ def commission_twin(arguments: Arguments) -> int:
             f"{twin.name}: {len(gaps)} gap(s) without measurements, the longest {duration_text(max(gaps))}; the "
             "estimate is stale there, and they take no part in the baseline"
         )
+    for item in coverage_of(fold, slice(0, fold.n)):
+        if item.by == WHOLE and item.coverage.high < COVERED:
+            complain(
+                f"{twin.name}: {item.subject} lies in its 95 % band {100 * item.coverage.value:.0f} % of the time, "
+                "which the baseline makes normal; fit the tuning (nisus tune) first"
+            )
     normals = baseline_of(fold, twin.name, force=arguments.force)
     text, path = lines(normals), section_file(twin)
     if arguments.write:

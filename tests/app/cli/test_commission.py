@@ -43,9 +43,9 @@ view:
 """
 
 
-def drive(folder, text=TWIN):
-    """A recording of 300 readings, noisier than the model believes, and its twin."""
-    y = 40.0 + np.random.default_rng(1).normal(0.0, 2.8, 300)
+def drive(folder, text=TWIN, noise=2.8, n=300):
+    """A recording of readings, noisier than the model believes, and its twin."""
+    y = 40.0 + np.random.default_rng(1).normal(0.0, noise, n)
     (folder / "drive.csv").write_text("t,y\n" + "".join(f"{k},{value:.3f}\n" for k, value in enumerate(y)))
     path = folder / "drive.yaml"
     path.write_bytes(text.encode())
@@ -64,6 +64,15 @@ def test_what_is_printed_is_what_is_read_again(tmp_path, capsys):
     # Against white innovations, not against what was normal before: the same again.
     assert commission_twin(CommissionCommand(path)) == 0
     assert capsys.readouterr().out == printed
+
+
+def test_bands_that_hold_too_little_are_told(tmp_path, capsys):
+    path = drive(tmp_path, noise=3.0, n=1500)
+    assert commission_twin(CommissionCommand(path)) == 0
+    track = fold((twin := load_twin(path)).estimator, twin.model, twin.tuning, read_log(twin, None)[0])
+    held = np.abs(track.innovation[:, 0]) < 1.96 * track.innovation_std[:, 0]
+    told = f"winding lies in its 95 % band {100 * held.mean():.0f} % of the time"
+    assert told in capsys.readouterr().err
 
 
 def test_every_figure_comes_back(tmp_path):
