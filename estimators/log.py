@@ -8,20 +8,7 @@ import numpy as np
 
 from .errors import EventError
 from .events import arrays
-from .events.batch import (
-    BEFORE,
-    COLUMN_TYPES,
-    INPUT,
-    KIND_NAMES,
-    MAINTENANCE,
-    MARK,
-    READING,
-    RESET,
-    TICK,
-    TRUTH,
-    Events,
-    truth_of,
-)
+from .events.batch import BEFORE, INPUT, KIND_NAMES, MAINTENANCE, MARK, READING, RESET, TICK, TRUTH, Events, truth_of
 from .events.checks import EventLayout, admitted
 from .events.maintenance import versions_dropped
 
@@ -97,8 +84,7 @@ class Log:
 
     def _allocate(self, capacity: int, columns: int) -> None:
         # Not filled: the system gives memory to the rows that have events, a tenth of the capacity of most twins.
-        self.t, self.arrival, self.kind, self.channel = (np.empty(capacity, kind) for kind in COLUMN_TYPES.values())
-        self.value = np.empty((capacity, columns))
+        self.t, self.arrival, self.kind, self.channel, self.value = Events.allocate(capacity, columns)
 
     @property
     def capacity(self) -> int:

@@ -269,15 +269,16 @@ def _covers(own):
 
 
 @inlined
-def grade(own, mask, gated, r):
+def grade(own, mask, gated, r, base):
     """Return the grade of the alarms of a row: 0 for none, `ADVISED` if its bands are valid, else `ACTED_ON`.
 
     Valid are bands that are too wide, and those that hold most measurements (`_covers`) in spite of spikes, of a scale
-    that is a little too small, and of a sign that alternates. They cover a correlation of e, which tests of unit
-    variance also see where e is merely small, if its mean square is small and its mean μ within the band of the
-    estimate itself, μ² ≤ (S - R) / S: an estimate that averages many measurements has a narrow band, however wide that
-    of a measurement is. They cover μ ≠ 0 only where the estimate follows each measurement, so that no error
-    accumulates. Valid, too, is an estimate from which a gate keeps the outliers, if e has the right scale without them.
+    that is a little too small, and of a sign that alternates; and those about a mean that is smaller than the accepted
+    one. They cover a correlation of e, which tests of unit variance also see where e is merely small, if its mean
+    square is small and its mean μ within the band of the estimate itself, μ² ≤ (S - R) / S: an estimate that averages
+    many measurements has a narrow band, however wide that of a measurement is. They cover μ ≠ 0 only where the estimate
+    follows each measurement, so that no error accumulates. Valid, too, is an estimate from which a gate keeps the
+    outliers, if e has the right scale without them.
     """
     if mask == 0:
         return 0.0
@@ -288,6 +289,8 @@ def grade(own, mask, gated, r):
             rest &= ~NARROW
     if _covers(own):
         rest &= ~(NARROW | SPIKY | ALTERNATING)
+    if abs(base[0] + base[1] * own[MEAN_E]) < abs(base[0]):
+        rest &= ~SHIFTED
     if rest & (SHIFTED | LAGGING) != 0:
         variance, mean, square = own[LAST_STD] * own[LAST_STD], own[MEAN_E], 1.0 + own[SQUARE_E]
         if mean * mean * variance <= variance - r:

@@ -27,6 +27,8 @@ from .detector_state import (
     ADVISED,
     ADVISED_ROWS,
     BEGUN,
+    CONTRADICTED,
+    COUNT,
     DUE,
     GRADE,
     HEARD,
@@ -74,6 +76,7 @@ from .detectors import (
     STUCK,
     TESTS,
 )
+from .memory import prior_flags
 from .references import HALF_WIDTH
 
 MIN_PARTICLES = 4.0
@@ -82,6 +85,9 @@ MIN_PARTICLES = 4.0
 POOR_MEASUREMENTS = 60
 """Measurements more, poor than not, from which particles are impoverished; cleared at half as many. Three times the
 number between two counts of ancestors: by chance one count may be 1, hardly three in succession."""
+
+
+FIRST_SIGMA = 5.0  # |e| of a sensor's first measurement that contradicts the prior
 
 
 @inlined
@@ -152,11 +158,13 @@ def _test(i, now, y, s, context, policy, state, track):
                 e = innovation / std
             if np.isfinite(e):
                 note_coverage(each, e, own)
+                if own[COUNT] == 1.0 and abs(e) > FIRST_SIGMA:
+                    state[CONTRADICTED] = 1.0
                 mask = mask & LOST | weigh(each, e, h, base, before)
         if k == 0:
             mask = mask & ~(DISAGREEING | AGREEING) | int(own[JOINT_MASK])
         each[MASK] = mask
-        graded, graded_before = grade(each, mask, context.gated, r), each[GRADE]
+        graded, graded_before = grade(each, mask, context.gated, r, base), each[GRADE]
         each[GRADE] = graded
         track.alarms[i, k] = mask | ADVISORY_ALARM if graded == ADVISED else mask
         state[SUSPECT_ROWS] += (graded == ACTED_ON) - (graded_before == ACTED_ON)
@@ -260,6 +268,10 @@ def watch_row(i, t, kind, channel, value, context, policy, state, track):
         if sensor_part(state, s)[SILENT] != 0.0:
             flags |= 1 << min(s, SENSOR_FLAGS - 1)
     silent = flags & SENSOR_MASK
+    if state[CONTRADICTED] != 0.0 and context.memory != 0:
+        found = prior_flags(context, row_part(state, sensors, rows).ctypes.data)
+        state[CONTRADICTED] = 1.0 if found != 0 else 0.0
+        flags |= found
     if context.fitted != 0:
         flags |= _range(i, u, context, track)
     if state[POOR_CLOUD] != 0.0:

@@ -27,7 +27,7 @@ from ..compiled.jacobians import scratch_size, state_jacobian
 from ..estimator import Estimator
 from ..model.state_space import StateSpaceModel
 from ..numerics.jit import inlined, part, plain
-from ..numerics.linalg import congruence, wrap
+from ..numerics.linalg import congruence, copy, wrap
 from ..numerics.workspace import declare_layout, size_of, view
 from .detectors import MEMORY_AT, MEMORY_FLAGS, memory_flag
 
@@ -100,9 +100,10 @@ def _clear(time):
 
 @inlined
 def _copy(time, other):
-    other.d[:] = time.d
-    other.D[:] = time.D
-    other.Phi[:] = time.Phi
+    copy(time.D, other.D)
+    copy(time.Phi, other.Phi)
+    for i in range(time.d.size):
+        other.d[i] = time.d[i]
 
 
 @part
@@ -121,8 +122,9 @@ def _carry(F, rows, time, products):
                 moved[i] += a * time.d[k]
                 for j in range(n):
                     products[i, j] += a * time.Phi[k, j]
-    time.d[:rows] = moved[:rows]
-    time.Phi[:rows] = products[:rows]
+    copy(products[:rows], time.Phi)
+    for i in range(rows):
+        time.d[i] = moved[i]
 
 
 @part
@@ -164,7 +166,8 @@ def _spread(kind, n, state, P):
 def before_update(context, at, state):
     """Keep the prediction."""
     own = memory_of(at, context.nx)
-    own.x[:] = state[: context.nx]
+    for i in range(context.nx):
+        own.x[i] = state[i]
     _spread(context.memory, context.nx, state, own.P)
 
 
@@ -192,6 +195,24 @@ def after_update(context, at, state):
 def memory_flags(at, n):
     """Return the bits of `Track.flags` of the states in alarm."""
     return int(memory_of(at, n).count[1]) << MEMORY_AT
+
+
+@part
+def prior_flags(context, at):
+    """Return the bits of `Track.flags` of the states of whose variance measurements have not yet taken half."""
+    n, bits = context.nx, 0
+    own, shown = memory_of(at, n), shown_states(context)
+    for s in range(min(shown.size, MEMORY_FLAGS)):
+        j = shown[s]
+        rho = own.P[j, j] / (own.P[j, j] + own.now.D[j, j])
+        for k in range(LEVELS):
+            level = level_of(own.end + 8 * k * level_words(n), n)
+            # 0 until two of its times have ended.
+            if level.rho[j] > 0.0:
+                rho = min(rho, level.rho[j])
+        if context.graded >> s & 1 != 0 and rho > 0.5:
+            bits |= 1 << s
+    return bits << MEMORY_AT
 
 
 @part

@@ -43,7 +43,12 @@ class Events(NamedTuple):
     @staticmethod
     def empty(width: int) -> Events:
         """Return a batch without events."""
-        return Events._make([*(np.zeros(0, kind) for kind in COLUMN_TYPES.values()), np.zeros((0, width))])
+        return Events.allocate(0, width)
+
+    @staticmethod
+    def allocate(rows: int, width: int) -> Events:
+        """Return columns for so many events, not filled."""
+        return Events._make([*(np.empty(rows, kind) for kind in COLUMN_TYPES.values()), np.empty((rows, width))])
 
     @staticmethod
     def one(t: int, arrival: int, kind: int, channel: int, values: object, width: int) -> Events:

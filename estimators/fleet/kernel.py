@@ -21,24 +21,7 @@ from ..estimator import Code, call_start
 from ..fold_kernel import fold_event
 from ..gate.rejection_runs import Rule
 from ..log import _ORDER
-from ..numerics.jit import (
-    B1,
-    F1,
-    F2,
-    I1,
-    borrowed,
-    counts,
-    embedded,
-    flag_rows,
-    flags,
-    floats,
-    i64,
-    ints,
-    jit,
-    masks,
-    matrix,
-    part,
-)
+from ..numerics.jit import borrowed, counts, embedded, flag_rows, flags, floats, i64, ints, jit, masks, matrix, part
 from ..track import WHITENED, Track, track_type
 from .memory import (
     AGE,
@@ -106,17 +89,18 @@ def _plan_at(typing_context, place):
 
 
 _TAKE = {
-    F1: "floats(own[{}], rows)",
-    I1: "ints(own[{}], rows)",
-    B1: "flags(own[{}], rows)",
-    types.int32[::1]: "counts(own[{}], rows)",
-    F2: "matrix(floats(own[{}], 0), 0, rows, {})",
-    types.Array(types.int32, 2, "C"): "masks(own[{}], rows, {})",
-    types.Array(types.int8, 2, "C"): "flag_rows(own[{}], rows, {})",
+    "float64, 1": "floats(own[{}], rows)",
+    "int64, 1": "ints(own[{}], rows)",
+    "int8, 1": "flags(own[{}], rows)",
+    "int32, 1": "counts(own[{}], rows)",
+    "float64, 2": "matrix(floats(own[{}], 0), 0, rows, {})",
+    "int32, 2": "masks(own[{}], rows, {})",
+    "int8, 2": "flag_rows(own[{}], rows, {})",
 }
 _widths = iter("nx nx 0 ny ny ny width ny".split())
 _columns = ", ".join(
-    _TAKE[kind].format(k, next(_widths) if kind.ndim == 2 else "") for k, kind in enumerate(track_type.types)
+    _TAKE[f"{kind.dtype}, {kind.ndim}"].format(k, next(_widths) if kind.ndim == 2 else "")
+    for k, kind in enumerate(track_type.types)
 )
 _named = {item.__name__: item for item in (Track, counts, flag_rows, flags, floats, ints, masks, matrix)}
 _track_at = register_jitable(eval(f"lambda own, rows, nx, ny, width: Track({_columns})", _named))

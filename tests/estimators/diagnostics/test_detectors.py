@@ -239,6 +239,8 @@ class RowOracle:
         n, out = self.outside, self.share
         if n < 100 or out - 1.645 * math.sqrt(out * (1.0 - out) / n) <= 0.1:
             rest -= {"narrow", "spiky", "alternating"}
+        if abs(mean * self.base[1] + self.base[0]) < abs(self.base[0]):
+            rest -= {"shifted up", "shifted down"}
         share = 1.0 - r / self.std**2 if self.std else 0.0
         if mean**2 <= share:
             lagging = {"correlated", "alternating"}
