@@ -37,7 +37,7 @@ from .context import (
     shape_signature,
 )
 from .jacobians import ANALYTIC, CENTRAL, COMPLEX_STEP, complex_step, scratch_size
-from .model_code import ModelCode, SharedCode, call_h, call_h_block
+from .model_code import ModelCode, SharedCode, call_h, call_h_block, call_own_F, call_own_H
 
 
 @dataclass(frozen=True)
@@ -312,7 +312,7 @@ def _check_derivatives(compiled: CompiledModel) -> None:
 
     tolerance = 1e-4  # central differences with a step of 1e-5 are good to about 1e-8; a wrong formula is off by more
     if static["F_mode"] == ANALYTIC:
-        error = disagree(lambda x, J: plain(model.F)(x, u, p, dt, J), f, model.nx)
+        error = disagree(lambda x, J: call_own_F(static["F"], x, u, p, dt, J), f, model.nx)
         if error > tolerance and is_derived(model.F):
             static["F_mode"] = CENTRAL
         elif error > tolerance:
@@ -330,7 +330,7 @@ def _check_derivatives(compiled: CompiledModel) -> None:
         rows = len(sensor.rows)
         mode = static["H_mode"][k]
         if mode == ANALYTIC:
-            error = disagree(lambda x, J, s=sensor: plain(s.H)(x, u, p, J), h, rows)
+            error = disagree(lambda x, J, target=int(static["H"][k]): call_own_H(target, x, u, p, J), h, rows)
             if error > tolerance and is_derived(sensor.H):
                 static["H_mode"][k] = CENTRAL
             elif error > tolerance:

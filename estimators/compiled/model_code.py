@@ -30,7 +30,7 @@ from ..model.check import uncompilable
 from ..model.state_space import StateSpaceModel
 from ..numerics.helpers import source_digest, with_helpers
 from ..numerics.jit import address, jit, plain
-from .context import call_h_rows
+from .context import call_F, call_H, call_h_rows
 
 MIN_SHARED = 16
 """Functions of equal code from which on they share it; fewer are compiled by themselves, with their constants."""
@@ -53,6 +53,18 @@ def call_h_block(target, X, u, p, out):
     """Rows of `out` (N, ny) = h of the function over rows at an address, at the rows of X (N, nx)."""
     rows, stride = X.shape
     call_h_rows(target, X.ctypes.data, stride, rows, u.ctypes.data, p.ctypes.data, out.ctypes.data, out.shape[1])
+
+
+@jit
+def call_own_F(target, x, u, p, dt, out):
+    """out = F(x, u, p, dt) of the function at an address."""
+    call_F(target, x, u, p, dt, out)
+
+
+@jit
+def call_own_H(target, x, u, p, out):
+    """out = H(x, u, p) of the function at an address."""
+    call_H(target, x, u, p, out)
 
 
 class ModelCode:

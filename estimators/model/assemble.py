@@ -42,7 +42,7 @@ from typing import NamedTuple
 import numpy as np
 
 from ..errors import ModelError, nearest
-from ..numerics.jit import inlined, plain, stack_vector
+from ..numerics.jit import inner_embedded, plain, stack_vector
 from .coloured import ColouredError, coloured
 from .hybrid import LearnedCorrection, hybrid, places
 from .instruments import Instrument, with_instruments
@@ -313,7 +313,7 @@ def _correlated(
     return replace(model, prior_correlation=tuple(map(tuple, whole.tolist())))
 
 
-@inlined
+@inner_embedded
 def _width(k, x, u, distances):
     """Return what η of parameter k is multiplied by: the distances outside their ranges, each times its width."""
     width = 0.0
@@ -325,7 +325,7 @@ def _width(k, x, u, distances):
     return width
 
 
-@inlined
+@inner_embedded
 def _within(value, low, high):
     """Return the value, or the end of the range beyond which it lies."""
     if value.real < low:
@@ -335,7 +335,7 @@ def _within(value, low, high):
     return value
 
 
-@inlined
+@inner_embedded
 def _fill(full, x, u, p, n, place, ends, distances):
     """Fill p(θ, δ, η): the model's own parameters, with moved and considered ones held within their ranges."""
     for k in range(place.shape[0]):
@@ -349,7 +349,7 @@ def _fill(full, x, u, p, n, place, ends, distances):
         full[k] = _within(value, ends[k, 0], ends[k, 1])
 
 
-@inlined
+@inner_embedded
 def _free(x, u, p, n, k, place, ends, distances):
     """Return the complex step of parameter k: zero where its range ends."""
     j, own, out = place[k, 0], place[k, 1], place[k, 2]

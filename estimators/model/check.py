@@ -12,7 +12,7 @@ from collections.abc import Callable, Iterator, Sequence
 from contextlib import suppress
 from functools import partial
 from pathlib import Path
-from types import CellType, CodeType, FunctionType
+from types import CodeType
 from typing import Any
 
 import numpy as np
@@ -138,19 +138,6 @@ def _near_prior(model: StateSpaceModel, values: Values) -> Iterator[Values]:
         yield values | away
 
 
-def interpreted(function: Any) -> Any:
-    """Return a function in plain Python, with those that it encloses.
-
-    Called from Python, a wrapper of this package would have the function inside compiled, for each of many sensors.
-    """
-    python = plain(function)
-    inside = [cell.cell_contents for cell in getattr(python, "__closure__", None) or ()]
-    if all(plain(item) is item for item in inside):
-        return python
-    cells = tuple(CellType(interpreted(item) if callable(item) else item) for item in inside)
-    return FunctionType(python.__code__, python.__globals__, python.__name__, python.__defaults__, cells)
-
-
 def refuse_writing(
     model: StateSpaceModel, what: str, function: Callable, takes: str, *out: np.ndarray, more: Values | None = None
 ) -> list[np.ndarray]:
@@ -163,7 +150,7 @@ def refuse_writing(
         ModelError: With the function's file and line.
     """
     prior = prior_values(model) | (more or {})
-    python = interpreted(function)
+    python = plain(function)
     for values in (*_near_prior(model, prior), prior):
         names = takes.split(", ")
         given = [values[name] for name in names]
@@ -191,7 +178,7 @@ def _call(
     given = [item.copy() if isinstance(item, np.ndarray) else item for item in map(values.get, takes.split(", "))]
     try:
         with np.errstate(all="ignore"):
-            result = interpreted(function)(*given, *out)
+            result = plain(function)(*given, *out)
             return result if out else float(result)
     except Exception as error:  # noqa: BLE001  the user's own function may raise anything
         at = f"x = {numbers(values['x'])}, u = {numbers(values['u'])}, p = {numbers(values['p'])}"

@@ -11,27 +11,18 @@ from collections.abc import Callable
 from dataclasses import replace
 from functools import lru_cache
 from typing import Any
-from uuid import UUID
 
 import numpy as np
 
-from ..numerics.helpers import source_digest, with_helpers
-from ..numerics.jit import jit, named, plain
+from ..numerics.helpers import compiled
+from ..numerics.jit import inner, named, plain
 from .state_space import StateSpaceModel
 
 
 @lru_cache(maxsize=256)
 def as_inner(function: Callable) -> Any:
-    """Compile a model's function for a wrapper to call, under a name by which Numba's cache finds it again.
-
-    The cache distinguishes closures by their enclosed values, and compiled functions by an identifier that is random in
-    every process. An identifier made from the source and from what it encloses finds the code that another process
-    compiled.
-    """
-    python = with_helpers(plain(function))
-    inner = jit(python)
-    inner._set_uuid(str(UUID(source_digest([python])[:32])))
-    return inner
+    """Compile a model's function for a wrapper to call, whose code LLVM copies into that of the wrapper."""
+    return compiled(plain(function), {}, forceinline=True)
 
 
 def derived(function: Callable) -> Callable:
@@ -92,7 +83,7 @@ def _indicator(model: StateSpaceModel) -> StateSpaceModel:
 
 
 @named
-@jit
+@inner
 def _between(m, count):
     """Return the lower of the two modes next to m, and the fraction of the way to the upper one."""
     low = 0
@@ -106,7 +97,7 @@ def _between(m, count):
 
 
 @named
-@jit
+@inner
 def _moments(c, part):
     """Return mean and variance of the next mode, from the chances c (2, modes) of two modes and the second's weight."""
     mean = 0.0 * part

@@ -15,7 +15,7 @@ from uuid import UUID
 
 from numba.core.serialize import dumps
 
-from .jit import jit, plain
+from .jit import inner, plain
 
 LIBRARIES = ("numpy", "scipy", "numba", "math", "cmath")
 """Packages whose functions Numba supports itself, or not at all."""
@@ -36,29 +36,32 @@ def _with_helpers(function: Any, known: dict[Any, Any]) -> Any:
     used = {name: function.__globals__[name] for name in _names(function.__code__) if name in function.__globals__}
     helpers = {name: item for name, item in used.items() if _plain(item) and item is not function}
     cells = [cell.cell_contents for cell in function.__closure__ or ()]
-    inner = [item for item in cells if _plain(item) and item is not function]
-    if not helpers and not inner:
+    enclosed = [item for item in cells if _plain(item) and item is not function]
+    if not helpers and not enclosed:
         return function
     world = dict(function.__globals__)
     closure = tuple(CellType(item) for item in cells) if cells else None
     made = FunctionType(function.__code__, world, function.__name__, function.__defaults__, closure)
     made.__kwdefaults__, made.__module__ = function.__kwdefaults__, function.__module__
-    made.__qualname__ = f"{function.__qualname__}_{source_digest([*helpers.values(), *inner])[:12]}"
+    made.__qualname__ = f"{function.__qualname__}_{source_digest([*helpers.values(), *enclosed])[:12]}"
     for name, item in helpers.items():
-        world[name] = _compiled(item, known)
+        world[name] = compiled(item, known)
     for cell, item in zip(closure or (), cells, strict=True):
-        if item in inner:
-            cell.cell_contents = _compiled(item, known)
+        if item in enclosed:
+            cell.cell_contents = compiled(item, known)
     return made
 
 
-def _compiled(helper: Any, known: dict[Any, Any]) -> Any:
+def compiled(helper: Any, known: dict[Any, Any], forceinline: bool = False) -> Any:
+    """Return a function compiled for compiled callers, under an identifier by which the cache finds them again.
+
+    Numba tells closures apart by what they hold, a compiled function by an identifier that is random by default: one
+    made from the source, and from what it encloses, finds the code that another process compiled.
+    """
     if helper not in known:
         # Registered first, so that a function that calls itself through its helpers does not recurse forever.
         known[helper] = helper
-        known[helper] = jit(_with_helpers(helper, known))
-        # Numba tells closures apart by what they hold, a compiled function by an identifier that is random by default:
-        # one made from the source finds the code that another process compiled.
+        known[helper] = inner(_with_helpers(helper, known), forceinline)
         known[helper]._set_uuid(str(UUID(source_digest([helper])[:32])))
     return known[helper]
 

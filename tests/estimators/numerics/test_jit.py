@@ -11,8 +11,9 @@ import pytest
 from numba.core.targetconfig import ConfigStack
 from numba.extending import intrinsic
 
+from estimators.model.wrapping import as_inner
 from estimators.numerics.cache_entries import EntryFiles
-from estimators.numerics.jit import by_address, embedded, jit, linkable, linkable_embedded, part
+from estimators.numerics.jit import by_address, embedded, inner, inner_embedded, jit, linkable, linkable_embedded, part
 from tests import ROOT
 
 LOADED = """
@@ -193,7 +194,10 @@ def test_a_caller_links_a_function_without_machine_code_of_its_own(tmp_path):
     assert len(list((tmp_path / "cache").rglob("linked.inner*.nbc"))) == 2
 
 
-KINDS = [(jit, False), (linkable, False), (part, False), (embedded, True), (linkable_embedded, True)]
+KINDS = [
+    *((kind, False) for kind in (jit, linkable, part, inner)),
+    *((kind, True) for kind in (embedded, linkable_embedded, inner_embedded)),
+]
 
 
 @pytest.mark.parametrize(("kind", "copied"), KINDS)
@@ -208,12 +212,12 @@ def test_what_llvm_must_copy_does_not_follow_from_the_first_caller(kind, copied,
         return a(a), lambda context, builder, signature, given: given[0]
 
     @kind
-    def inner(a):
+    def within(a):
         return note(a) + new
 
     @caller
     def first(a):
-        return inner(a)
+        return within(a)
 
     @jit
     def outer(a):
@@ -221,6 +225,11 @@ def test_what_llvm_must_copy_does_not_follow_from_the_first_caller(kind, copied,
 
     assert outer(1.0) == 1.0 + 2.0 * new
     assert set(flags) == {copied}
+
+
+def test_a_function_within_others_runs_in_python_as_it_is_written():
+    """Numba knows no `hex`. Checks of a model call its functions, each of which was compiled for that alone."""
+    assert as_inner(lambda a: a.hex())(1.0) == "0x1.0000000000000p+0"
 
 
 def test_a_function_for_addresses_names_its_python_form_when_called():
