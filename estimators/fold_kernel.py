@@ -249,7 +249,7 @@ def run_and_judge(
     context = context_at(context_place)
     kept = np.empty(context.n_rows if value.shape[1] > width else 0)
     passed = np.empty(value.shape[1])
-    memory = row_part(evidence, context.n_sensors, context.n_rows).ctypes.data
+    memory = row_part(evidence, context.n_sensors, context.n_rows).ctypes.data + 8 * u.size
     if context.memory == 0 or policy.window == 0:
         memory = 0
     for k in range(stops.size):

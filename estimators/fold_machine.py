@@ -123,7 +123,7 @@ class Machine:
             "n_baseline": own["baseline"].size,
             "width": model.width,
             "seed": tuning.seed,
-            **memory_context(self.estimator, model),
+            **memory_context(self.estimator, model, self.policy.corrections),
         }
         plain = {k: v.ctypes.data if isinstance(v, np.ndarray) else v for k, v in self.held.items()}
         return context_of(**plain, **sizes)
@@ -171,7 +171,10 @@ class Machine:
         self.begin(base.mean, base.cov, now.state)
         left = [(now.edge, base.edge)]
         if base.estimator == self.estimator.name and base.state is not None and base.state.size == now.state.size:
-            left += [(now.state, base.state), (now.evidence, base.evidence), (now.doubt, base.doubt)]
+            left += [(now.state, base.state), (now.doubt, base.doubt)]
+            if base.evidence is not None:
+                # A fleet follows no memory of the states, which comes last.
+                left += [(now.evidence[: base.evidence.size], base.evidence)]
         for mine, its in left:
             if its is not None and its.shape == mine.shape:
                 mine[:] = its

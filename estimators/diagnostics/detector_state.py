@@ -27,20 +27,10 @@ from .health import HealthPolicy, normal_nis
 # Twin: rows in alarm, of which the bands are valid and wider than necessary; rows lost; time at which the next sensor
 # drops out; time of the first event, whether a measurement has arrived; sensors that dropped out; measurements more,
 # poor than not, of a particle filter, and whether it is impoverished; measurements until divergence is judged after a
-# reset; whether the first measurement of a sensor contradicts the prior.
-(
-    SUSPECT_ROWS,
-    ADVISED_ROWS,
-    LOST_ROWS,
-    NEXT_DUE,
-    BEGUN,
-    HEARD,
-    SILENT_SENSORS,
-    POOR,
-    POOR_CLOUD,
-    UNSETTLED,
-    CONTRADICTED,
-) = range(11)
+# reset; if the first measurement of a sensor contradicts the prior, the flags of the states that it still determines,
+# at first all.
+SUSPECT_ROWS, ADVISED_ROWS, LOST_ROWS, NEXT_DUE, BEGUN, HEARD, SILENT_SENSORS, POOR, POOR_CLOUD = range(9)
+UNSETTLED, CONTRADICTED = 9, 10
 TWIN = 11
 
 # Sensor: W of the joint tests, then the number of measurements, time of the first and the last, longest gap, threshold
@@ -55,7 +45,7 @@ SENSOR = JOINT + 8  # Numbers in the state for each sensor
 # predicted during the present run, the sum of squares of its steps, and their predicted variance; standard deviation
 # of the last prediction, of that before a reset, and measurements until the tests begin again after it; the next e
 # that each filter of `GAINS` predicts; the share of recent measurements outside their bands, and the number of these.
-# The memory of the states, if it is followed, and the inputs that hold come after the rows.
+# The inputs that hold come after the rows, then the memory of the states, if it is followed.
 MASK, RAW, WHITE, VALUE, QUANTUM, RUN, EQUAL, COUNTED = range(TESTS, TESTS + 8)
 CALM_FOR, MEAN_E, SQUARE_E, KNOWN, GRADE, LEFT, LEFT_VARIANCE = range(TESTS + 8, TESTS + 15)
 MOVED, MOVED_SQUARES, MOVED_VARIANCE, LAST_STD, STD_BEFORE, RESETTING, EXPECTED = range(TESTS + 15, TESTS + 22)
@@ -141,7 +131,7 @@ def fresh(model: StateSpaceModel, memory: np.ndarray | None = None) -> np.ndarra
     state[NEXT_DUE], state[BEGUN] = np.inf, np.nan
     _sensors(model, state)[:, DUE] = np.inf
     _rows(model, state)[:, [RAW, WHITE, VALUE, LEFT]] = np.nan
-    return np.concatenate((state, () if memory is None else memory, model.default_inputs))
+    return np.concatenate((state, model.default_inputs, () if memory is None else memory))
 
 
 def _sensors(model: StateSpaceModel, state: np.ndarray) -> np.ndarray:

@@ -263,9 +263,8 @@ def note_coverage(own, e, sensor):
 
 @inlined
 def _covers(own):
-    """Return whether it is credible that 90 % of the measurements lie in their bands, or too few are known."""
-    n, share = own[COUNTED_OUT], own[OUT]
-    return n < COVERED_READINGS or share - ONE_SIDED * math.sqrt(share * (1.0 - share) / n) <= 1.0 - COVERED
+    """Return whether it is credible that 90 % of the measurements lie in their bands."""
+    return own[OUT] <= 1.0 - COVERED + ONE_SIDED * math.sqrt(COVERED * (1.0 - COVERED) / max(own[COUNTED_OUT], 1.0))
 
 
 @inlined

@@ -159,7 +159,7 @@ def _test(i, now, y, s, context, policy, state, track):
             if np.isfinite(e):
                 note_coverage(each, e, own)
                 if own[COUNT] == 1.0 and abs(e) > FIRST_SIGMA:
-                    state[CONTRADICTED] = 1.0
+                    state[CONTRADICTED] = -1.0
                 mask = mask & LOST | weigh(each, e, h, base, before)
         if k == 0:
             mask = mask & ~(DISAGREEING | AGREEING) | int(own[JOINT_MASK])
@@ -234,7 +234,7 @@ def watch_row(i, t, kind, channel, value, context, policy, state, track):
     sensors, rows, nu = context.n_sensors, context.n_rows, context.nu
     width = track.alarms.shape[1]
     expected = ints(context.expected, sensors)
-    u = floats(state.ctypes.data + 8 * (state.size - nu), nu)
+    u = floats(row_part(state, sensors, rows).ctypes.data, nu)
     now = t[i] * 1e-9
     if not np.isfinite(state[BEGUN]):
         state[BEGUN] = now
@@ -269,9 +269,9 @@ def watch_row(i, t, kind, channel, value, context, policy, state, track):
             flags |= 1 << min(s, SENSOR_FLAGS - 1)
     silent = flags & SENSOR_MASK
     if state[CONTRADICTED] != 0.0 and context.memory != 0:
-        found = prior_flags(context, row_part(state, sensors, rows).ctypes.data)
-        state[CONTRADICTED] = 1.0 if found != 0 else 0.0
-        flags |= found
+        left = int(state[CONTRADICTED]) & prior_flags(context, u.ctypes.data + 8 * nu)
+        state[CONTRADICTED] = float(left)
+        flags |= left
     if context.fitted != 0:
         flags |= _range(i, u, context, track)
     if state[POOR_CLOUD] != 0.0:

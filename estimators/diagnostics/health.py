@@ -45,6 +45,7 @@ class HealthPolicy(NamedTuple):
         false_alarm_every: Mean seconds between false alarms of all detectors, which make it suspect or degraded.
         silent_periods: Mean periods after which a sensor has dropped out, and at least twice its longest gap; more
             while its period is known from few measurements.
+        corrections: Whether states are judged by their corrections (`memory.py`), 1 or 0; those of a fleet are not.
     """
 
     window: int = 50
@@ -54,6 +55,7 @@ class HealthPolicy(NamedTuple):
     diverged_gated: float = 0.5
     false_alarm_every: float = 86400.0
     silent_periods: float = 6.0
+    corrections: int = 1
 
 
 class Bounds(NamedTuple):
@@ -64,7 +66,7 @@ class Bounds(NamedTuple):
 
 
 bounds_type = types.NamedUniTuple(F1, len(Bounds._fields), Bounds)
-policy_type = types.NamedTuple((i64, f64, f64, f64, f64, f64, f64), HealthPolicy)
+policy_type = types.NamedTuple((i64, f64, f64, f64, f64, f64, f64, i64), HealthPolicy)
 
 
 def chi_square_bounds(max_dof: int) -> Bounds:

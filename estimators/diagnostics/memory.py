@@ -64,17 +64,17 @@ def level_words(n):
     return 2 * n * n + 3 * n + 2
 
 
-def memory_context(estimator: Estimator, model: StateSpaceModel) -> dict[str, int]:
+def memory_context(estimator: Estimator, model: StateSpaceModel, followed: int) -> dict[str, int]:
     """Return the memory's entries of a filter's context.
 
-    `memory` is how the filter's state keeps its spread, `COVARIANCE` or `FACTOR`, or 0 if no memory is followed; bits
+    `memory` is how the filter's state keeps its spread, `COVARIANCE` or `FACTOR`, or 0 if no memory is `followed`; bits
     of shown states are set in `graded` if their memory is judged, and in `unwatched` if it leaves the twin's health.
     """
-    followed = model.nx <= MOST and not model.black_box and estimator.family == "Gaussian"
+    possible = model.nx <= MOST and not model.black_box and estimator.family == "Gaussian"
     kind = FACTOR if estimator.name.startswith("sr-") else COVARIANCE
     shown = model.shown_states[:MEMORY_FLAGS]
     return {
-        "memory": kind if followed else 0,
+        "memory": kind if followed and possible else 0,
         "graded": sum(1 << k for k, state in enumerate(shown) if not state.appended),
         "unwatched": sum(memory_flag(k) for k, state in enumerate(shown) if not state.watched),
     }

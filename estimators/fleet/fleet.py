@@ -113,7 +113,7 @@ class Fleet:
             raise EstimatorError(
                 f"fleet: {count} assets, recent is {recent}; assets must be positive, recent 0 to 4096"
             )
-        self.policy, self.recent = policy or HealthPolicy(), recent
+        self.policy, self.recent = (policy or HealthPolicy())._replace(corrections=0), recent
         given = [Tuning.of(model)] if tuning is None else [tuning] if isinstance(tuning, Tuning) else list(tuning)
         if len(given) not in (1, count):
             raise EstimatorError(f"fleet: {len(given)} tunings for {count} assets; give one, or one per asset")

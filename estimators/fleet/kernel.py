@@ -54,7 +54,7 @@ from .window import has_no_baseline, return_to, slide
 _PLAN = """
     memory stride visited begins ends unfinished asked count order t place value events tunings contexts rules crews
     crew_places records free start predict update describe nx nu state evidence edge sensors rows ny width work window
-    kept recent columns size slots hot record_slots record_rows low high quantiles
+    corrections kept recent columns size slots hot record_slots record_rows low high quantiles
     degraded_after stale_after diverged_nis diverged_gated false_alarm_every silent_periods
 """.split()
 PLAN = np.dtype([(name, np.float64 if k > _PLAN.index("quantiles") else np.int64) for k, name in enumerate(_PLAN)])
@@ -234,7 +234,7 @@ def _fold_share(place, crew):
     rule = Rule(0, 0)
     policy = HealthPolicy(
         plan.window, plan.degraded_after, plan.stale_after, plan.diverged_nis, plan.diverged_gated,
-        plan.false_alarm_every, plan.silent_periods,
+        plan.false_alarm_every, plan.silent_periods, plan.corrections,
     )  # fmt: skip
     bounds = Bounds(floats(plan.low, plan.quantiles), floats(plan.high, plan.quantiles))
     visited, unfinished, asked = (

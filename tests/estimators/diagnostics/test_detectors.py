@@ -236,8 +236,8 @@ class RowOracle:
         mean, square, _ = self.recent
         if gated and "spiky" in rest:
             rest -= {"spiky", "narrow"} if square < 0.3 else {"spiky"}
-        n, out = self.outside, self.share
-        if n < 100 or out - 1.645 * math.sqrt(out * (1.0 - out) / n) <= 0.1:
+        # The share beyond which a test of 10 % rejects it, with a risk of 5 %.
+        if self.share <= 0.1 + 1.645 * 0.3 / math.sqrt(max(self.outside, 1)):
             rest -= {"narrow", "spiky", "alternating"}
         if abs(mean * self.base[1] + self.base[0]) < abs(self.base[0]):
             rest -= {"shifted up", "shifted down"}

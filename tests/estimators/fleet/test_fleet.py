@@ -16,7 +16,7 @@ from estimators.track import GATED, HEALTH_NAMES
 from tests.models import level_model
 from tests.support import folded
 
-POLICY = HealthPolicy(window=12, degraded_after=40.0, stale_after=90.0)
+POLICY = HealthPolicy(window=12, degraded_after=40.0, stale_after=90.0, corrections=0)
 """A window short enough that it is full, and slides, in the logs of these tests."""
 
 
