@@ -256,7 +256,8 @@ def _weigh(time, P, estimated, level):
         if not (np.isfinite(rho) and np.isfinite(time.d[j])):
             return False
         level.rho[j] = rho
-        if rho < 1.0 - 1e-9:
+        # A correction of a prior that hardly counts tells nothing of the model.
+        if LOW < rho < HIGH:
             shared = 0.0
             for k in range(estimated, level.W.size):
                 shared += time.D[j, k] * P[k, j] / P[k, k]
