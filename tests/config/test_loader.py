@@ -1,4 +1,3 @@
-import csv
 import os
 from pathlib import Path
 from typing import Annotated
@@ -13,8 +12,7 @@ from config.source_schema import CanSection, SimulatorSection
 from config.yaml_files import as_flow, as_section, parse
 from estimators.errors import ConfigError
 from estimators.tuning import REOPEN_S
-
-MISTAKES = Path(__file__).with_name("mistakes.csv").open()
+from tests.cases import cases
 
 MOTOR = """\
 model: motor_winding
@@ -56,11 +54,10 @@ def test_values_are_read_and_defaults_filled_in():
     assert loaded.places.at(("source", "inputs", "torque", 1)) == "folder/motor.yaml:13"
 
 
-@pytest.mark.parametrize("row", [*csv.DictReader(MISTAKES, delimiter="\t", quoting=csv.QUOTE_NONE)])
-def test_a_value_that_breaks_a_rule_is_one_line(row):
-    old, new = (row[key].replace(r"\n", "\n") for key in ("old", "new"))
+@cases(__file__, "mistakes.csv")
+def test_a_value_that_breaks_a_rule_is_one_line(old, new, expected):
     assert old in MOTOR
-    assert message(MOTOR.replace(old, new, 1)) == row["expected"]
+    assert message(MOTOR.replace(old, new, 1)) == expected
 
 
 def test_a_missing_type_is_told_those_of_the_schema(monkeypatch):

@@ -18,6 +18,7 @@ from estimators.errors import NisusError
 from estimators.fold import Fold
 from estimators.log import Events
 from estimators.track import HEALTH_NAMES, VERDICT_NAMES
+from tests.cases import cases
 
 FLEET = """twin: motor_winding
 source:
@@ -133,36 +134,13 @@ def test_rows_of_a_blank_name_are_of_no_asset(tmp_path, monkeypatch):
     running.stop()
 
 
-@pytest.mark.parametrize(
-    ("change", "line"),
-    [
-        ({"twin: motor_winding": "twin: motor_windig"}, "pumps.yaml:1: twin is 'motor_windig'; there is no such file"),
-        ({"twin: motor_winding": "twin: motor_winding\nasets: 3"}, "pumps.yaml:2: asets is not known; did you mean"),
-        ({"twin: motor_winding": "twin: motor_winding\nassets: [a, a]"}, "pumps.yaml:2: assets names 'a' twice"),
-        ({"twin: motor_winding": "twin: motor_winding\nassets: 0"}, "pumps.yaml:2: assets"),
-        ({"twin: motor_winding": "twin: motor_winding\nassets: [a, ' ']"}, "assets names ' ', which is blank; give"),
-        ({"twin: motor_winding": "twin: motor_winding\nassets: [a, '']"}, "pumps.yaml:2: assets[1] is ''; it must not"),
-        ({"twin: motor_winding": "twin: motor_winding\noutputs: {mqtt: {host: a, prefix: 'a/#'}}"},
-         "outputs.mqtt.prefix is 'a/#'; leave out the characters + and #"),
-        ({"twin: motor_winding": "twin: motor_winding\noutputs: {mqtt: {host: 'a b'}}"},
-         "outputs.mqtt.host is 'a b'; give a host name or an IP address"),
-        ({"twin: motor_winding": "twin: motor_winding\noutputs: {receivers: {a: {type: webhook, url: 'ftp://x'}}}"},
-         "outputs.receivers.a.url is 'ftp://x'; give an address such as https://HOST/PATH"),
-        ({"  asset: pump\n": ""}, "source.asset is missing"),
-        ({"asset: pump": "asset: pum"}, "there is no column 'pum'; did you mean pump?"),
-        ({"winding:": "windng:"}, "pumps.yaml:8: source.sensors"),
-        ({"files: a.csv": "files: b.csv"}, "pumps.yaml:4: source.files is not there"),
-        ({"temperature}": "temperature, accuracy: {std: s}}"}, "leave accuracy out"),
-    ],
-)  # fmt: skip
-def test_a_wrong_file_is_one_line(change, line, tmp_path, monkeypatch, capsys):
+@cases(__file__, "wrong_fleets.csv")
+def test_a_wrong_file_is_one_line(before, after, line, tmp_path, monkeypatch, capsys):
     monkeypatch.chdir(tmp_path)
     write(tmp_path / "a.csv", pump_rows(count=2))
     text = FLEET.format(files="a.csv")
-    for before, after in change.items():
-        assert before in text
-        text = text.replace(before, after)
-    (tmp_path / "pumps.yaml").write_text(text)
+    assert before in text
+    (tmp_path / "pumps.yaml").write_text(text.replace(before, after))
     assert main(["fleet", "pumps.yaml", "--port", "0"]) == 2
     said = capsys.readouterr().err.strip()
     assert line in said and "\n" not in said and "pumps.yaml" in said

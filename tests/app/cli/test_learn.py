@@ -12,6 +12,7 @@ from app.twin.twin import load_twin
 from estimators.diagnostics.score import score
 from estimators.errors import ConfigError
 from estimators.log import TRUTH
+from tests.cases import cases
 from tests.support import folded
 
 MODEL = """\
@@ -173,24 +174,9 @@ def test_a_net_is_judged_kept_and_folded(heated, nisus):
     assert np.isfinite(track.mean[log.kind[: log.n] == TRUTH]).all()
 
 
-@pytest.mark.parametrize(
-    ("arguments", "said"),
-    [
-        (["--corrects", ","], "--corrects names nothing; write names with commas"),
-        (["--corrects", "bdy"], "model vessel has no state 'bdy'; did you mean body?"),
-        (["--features", "laod"], "model vessel has no state or input 'laod'; did you mean load?"),
-        (["--window", "0"], "--window 0: must be positive"),
-        (["--window", "400"], "it takes 8 or more of two blocks: use a longer recording, or shorter windows"),
-        (["--blocks", "2"], "--blocks 2: must be 3 or more, or nothing is held out"),
-        (["--kind", "net"], "--net FILE.onnx: is for --kind net, which needs it"),
-        (["--net", "a.onnx"], "--net FILE.onnx: is for --kind net, which needs it"),
-        (["--keep", "a.txt"], "--keep a.txt: must end in .yaml"),
-        (["--keep", "nowhere/a.yaml"], "--keep nowhere/a.yaml: there is no folder nowhere; create it first"),
-        (["--estimator", "rbpf"], "rbpf"),
-    ],
-)
+@cases(__file__, "refused_learn.csv")
 def test_wrong_arguments_are_one_line(heated, nisus, arguments, said):
-    assert said in nisus.refuses("learn", heated, *LEARN, "--kind", "ridge", *arguments)
+    assert said in nisus.refuses("learn", heated, *LEARN, "--kind", "ridge", *arguments.split())
 
 
 def test_without_onnxruntime_a_line_says_what_to_install(tmp_path, monkeypatch):

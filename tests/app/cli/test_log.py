@@ -7,6 +7,7 @@ import pytest
 from app.studies.advice.signals import noise_of
 from app.twin.twin import load_twin
 from sources.inspect import SignalSeries
+from tests.cases import cases
 
 DBC = """VERSION ""
 
@@ -168,32 +169,14 @@ def test_tables_of_other_columns_are_listed_one_after_the_other(tmp_path, nisus)
     assert "two.csv begins 1 s after the end of one.csv; " in said.err and "time.shift" in said.err
 
 
-@pytest.mark.parametrize(
-    ("content", "more", "said"),
-    [
-        ("t,t\n1,2\n", [], "{0}: there are 2 columns 't'; give each its own name"),
-        ("t,a\n", [], "{0}: it has a header and no rows; record it again"),
-        ("hello world\n", [], "{0}: has one column, 'hello world'; a table has a header, a column of times and one of"),
-        ("t,a\nsoon,1\nlate,2\n", [],
-            "no row has a time; a.csv:2: t is 'soon', which is neither a time in s nor a date"),
-        ("t,a\n1,x\n2,y\n", [], "{0}: no column beside t has numbers (text in a)"),
-        ("t,a\n1,5\n1,6\n", [], "{0}: its 2 times are all the same; if t is not the time, name it with --time; "),
-        ("t,a\n1,5\n2,6\n", [],
-            "{0}: no signal has more than 2 values, of which a draft needs 20; record a longer log"),
-        ('{"t": 1}', [], "{0}: is no table; it is JSON; export it as CSV"),
-        ("t,a\n1,5\n", ["--dbc", "no.dbc"], "--dbc no.dbc: there is no such file; check the path"),
-        ("t,a\n1,5\n", ["--dbc", "car.dbc"], "--dbc car.dbc: describes CAN logs, and {0} is a table; leave it out"),
-        ("t,a\n1,5\n", ["{0}"], "{0}: is given twice; name each recording once"),
-        ("t,a\n1,5\n", ["drive.blf"], "drive.blf: no message of it is in a DBC; give one that describes it with"),
-    ],
-)  # fmt: skip
+@cases(__file__, "undrafted.csv")
 def test_a_file_of_which_no_twin_can_be_drafted_is_refused_with_the_remedy(
     drive, nisus, monkeypatch, content, more, said
 ):
     path = drive / "a.csv"
     path.write_text(content)
     monkeypatch.chdir(drive)
-    given = [word.format(path) for word in more]
+    given = [word.format(path) for word in more.split()]
     assert said.format(path) in nisus.refuses("new", "pump", "--log", str(path), *given)
     assert not list(drive.glob("pump*"))
 

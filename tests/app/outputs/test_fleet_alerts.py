@@ -19,6 +19,7 @@ from estimators.fleet.fleet import Fleet
 from estimators.models import MODELS
 from estimators.track import HEALTH_NAMES
 from tests.app.outputs.test_alerts import kept_in, state
+from tests.cases import cases
 from tests.waiting import wait_for
 
 BEGIN, SECOND = 1_767_225_600 * 10**9, 10**9
@@ -186,17 +187,8 @@ def test_a_fleet_that_stands_still_does_not_tell_that_it_runs(tmp_path):
     assert len(beats) <= before + 1  # one look may be under way
 
 
-@pytest.mark.parametrize(
-    ("outputs", "alerts", "text"),
-    [
-        ({}, [{"health": "degraded"}], "alerts[0] has no receiver; name one under outputs.receivers"),
-        ({"receivers": {"ops": {"type": "mqtt"}}}, [], "is of type mqtt; give the broker under outputs.mqtt"),
-        ({"receivers": {"ops": {"type": "command", "command": ["x"]}}}, [{"health": "stale", "to": ["op"]}],
-         "names 'op', no receiver under outputs.receivers; did you mean ops"),
-        ({}, [{"nis": 3}], "alerts[0].nis is not known"),
-    ],
-)  # fmt: skip
+@cases(__file__, "refused_alerts.csv")
 def test_a_wrong_rule_or_receiver_is_one_line(outputs, alerts, text, tmp_path):
     with pytest.raises(ConfigError) as caught:
-        started(tmp_path, outputs, alerts)
+        started(tmp_path, json.loads(outputs), json.loads(alerts))
     assert text in str(caught.value) and "pumps.yaml:1" in str(caught.value) and "\n" not in str(caught.value)

@@ -16,6 +16,7 @@ from sources.brokers import MqttSource, TopicMap
 from sources.messages import Messages
 from sources.source import Channel, ignore
 from tests.app.outputs.broker import Broker, Listener
+from tests.cases import cases
 from tests.support import SECOND, free_port
 from tests.waiting import wait_for
 
@@ -204,31 +205,11 @@ def test_a_source_whose_broker_comes_back_goes_on(serve, broker):
     listener.stop()
 
 
-@pytest.mark.parametrize(
-    ("source", "text"),
-    [
-        ({"type": "mqtt", "host": "x", "topics": {}}, "topics"),
-        ({"type": "mqtt", "host": "x", "topics": {"a": "windng"}},
-            "names 'windng', no value of this twin; did you mean"),
-        ({"type": "mqtt", "host": "x", "topics": {"a": "winding"}, "password_env": "NISUS_NO"},
-            "source.password_env is NISUS_NO, an environment variable that is not set"),
-        ({"type": "mqtt", "host": "x", "topics": {"a": {"tme": "t"}}}, "tme"),
-        ({"type": "mqtt", "host": "x", "topics": {"a/#/b": "winding"}}, "topics names a/#/b; + and # must stand"),
-        ({"type": "mqtt", "host": "x", "topics": {"a+/b": "winding"}}, "topics names a+/b; + and # must stand"),
-        ({"type": "opcua", "url": "opc.tcp://x:1", "nodes": {"winding": "Tank.Level"}},
-            "node 'Tank.Level' of winding is no node id; it must be like ns=2;s=Tank.Level"),
-        ({"type": "modbus", "host": "x", "registers": {"windng": 1}},
-            "registers names 'windng', no value of this twin"),
-        ({"type": "modbus", "host": "x", "registers": {"winding": {"address": 65535, "type": "float32"}}},
-            "registers.winding.address is 65535; a float32 has 2 registers, so it is at most 65534"),
-        ({"type": "modbus", "host": "x", "registers": {"winding": {"address": 4, "table": "coil", "words": "big"}}},
-            "source.registers.winding.table is coil, a bit; leave type and words out, or read a register"),
-    ],
-)  # fmt: skip
+@cases(__file__, "refused_sources.csv")
 def test_a_source_that_cannot_be_is_refused_in_one_line(source, text, monkeypatch):
     monkeypatch.delenv("NISUS_NO", raising=False)
     with pytest.raises(NisusError) as error:
-        load_twin("motor_winding", overrides={"source": json.dumps(source)}).open_source(ignore)
+        load_twin("motor_winding", overrides={"source": source}).open_source(ignore)
     assert text in str(error.value) and "\n" not in str(error.value)
 
 

@@ -26,6 +26,7 @@ from tests.app.outputs.broker import Broker, Listener
 from tests.app.outputs.modbus_device import Device
 from tests.app.outputs.test_alerts import state
 from tests.app.scripted import pull_all
+from tests.cases import cases
 from tests.support import SECOND, free_port
 from tests.waiting import wait_for
 
@@ -261,23 +262,10 @@ def test_the_names_of_a_dbc_are_those_of_c(serve, tmp_path, name, word):
     assert [message.name for message in database.messages][0] == f"{word}_temperature_mean"
 
 
-@pytest.mark.parametrize(
-    ("outputs", "text"),
-    [
-        ({"can": {"interface": "virtual", "channel": "x", "id": 255, "dbc": "{}/e.dbc"}},
-         "identifier 0x100 is Plant of the source's database"),
-        ({"can": {"interface": "virtual", "channel": "x", "id": 2045, "dbc": "{}/e.dbc"}},
-         "2 states need the identifiers 0x7fd to 0x800; the largest is 0x7ff"),
-        ({"can": {"interface": "virtual", "channel": "x", "id": 1536, "dbc": "{}/none/e.dbc"}}, "cannot be written"),
-        ({"can": {"interface": "virtual", "channel": "x", "id": 1536, "dbc": "{}/plant.dbc"}},
-         "plant.dbc is not written by Nisus, and is kept; choose another path, or move it"),
-        ({"opcua": {"host": "0.0.0.0"}}, "outputs.opcua.host is not this machine; give user and password_env too"),
-        ({"opcua": {"user": "a"}}, "needs both user and password_env, or neither"),
-    ],
-)  # fmt: skip
+@cases(__file__, "refused_outputs.csv")
 def test_an_output_that_cannot_be_is_refused_in_one_line(serve, tmp_path, outputs, text):
     plant = Plant(tmp_path, None)
-    overrides = {"source": json.dumps(plant.source("can")), "outputs": json.dumps(outputs).replace("{}", str(tmp_path))}
+    overrides = {"source": json.dumps(plant.source("can")), "outputs": outputs.replace("{}", str(tmp_path))}
     page = serve()
     with pytest.raises(ConfigError) as error:
         page.engine.twin = load_twin("motor_winding", overrides=overrides)

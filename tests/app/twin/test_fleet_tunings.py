@@ -12,6 +12,7 @@ from estimators import Log
 from estimators.errors import ConfigError
 from estimators.fold import Fold
 from sources.source import NO_ASSET
+from tests.cases import cases
 
 ASSETS = ("a", "b", "pump 3")
 
@@ -77,32 +78,8 @@ def test_named_assets_are_listed_before_they_report_and_others_are_still_taken(t
     assert list(found) == ["z", *ASSETS] and np.isnan(found["z"]).all() and NO_ASSET not in said
 
 
-@pytest.mark.parametrize(
-    ("table", "more", "words"),
-    [
-        ("asset,R.windin\na,1\n", {}, r"tunings.csv:1: R.windin is not a tuning key of motor_winding; .*R.winding"),
-        ("asset,gate\na,1\n", {}, r"tunings.csv:1: 'gate' is no value of Q, R or p"),
-        ("pump,R.winding\na,1\n", {}, r"tunings.csv:1: has no column 'asset'"),
-        ("asset,R.winding [V]\na,1\n", {}, r"tunings.csv:1: R.winding: .*V"),
-        ("asset,R.winding\na,1\nb,\n", {}, r"tunings.csv:3: asset b: R.winding is missing; give a number"),
-        ("asset,R.winding\na,1\nb,much\n", {}, r"tunings.csv:3: asset b: R.winding is 'much'; give a number"),
-        ("asset,R.winding\na,1\nb,-2\n", {}, r"tunings.csv:3: asset b: R.winding is -2; a variance must be positive"),
-        ("asset,R.winding\na,1\na,2\n", {}, r"tunings.csv:3: asset 'a' has a row already"),
-        ("asset,R.winding\na\n", {}, r"tunings.csv:2: the row has 1 cells and the heading 2"),
-        ("asset,R.winding\n,1\n", {}, r"tunings.csv:2: the row names no asset"),
-        (None, {"tunings": {"values": {" ": {"R.winding": 1.0}}}}, r"pumps.yaml:\d+: asset ' ' is blank; give it a"),
-        ("", {}, r"tunings.csv:1: has no column 'asset'"),
-        ("asset,R.winding\na,1\nc,1\n", {"assets": ["a", "b"]}, r"tunings.csv:3: asset 'c' is not among assets"),
-        ("asset,R.winding\na,1\nc,1\n", {"assets": 1}, r"pumps.yaml:\d+: tunings names 2 assets; there may be 1"),
-        (None, {"tunings": {"file": "t.csv"}}, r"pumps.yaml:\d+: tunings.file is 't.csv'; there is no such file"),
-        (None, {"tunings": {}}, r"tunings has neither file nor values"),
-        (None, {"tunings": {"values": {"a": {"R.x": 1.0}}}}, r"pumps.yaml:\d+: R.x is not a tuning key"),
-        (None, {"tunings": {"values": {"a": {"R.winding": "much"}}}}, r"pumps.yaml:\d+: .*R.winding is 'much'"),
-        (None, {"tunings": {"values": {"a": {"R.winding": -1.0}}}}, r"pumps.yaml:\d+: asset a: R.winding is -1"),
-    ],
-)
+@cases(__file__, "fleet_tunings.csv")
 def test_mistakes_are_one_line_with_its_place(table, more, words, tmp_path):
-    given = {"tunings": {"file": "tunings.csv"}} if table is not None else {}
     with pytest.raises(ConfigError, match=words) as caught:
-        load_fleet(write(tmp_path, table, **{**given, **more}))
+        load_fleet(write(tmp_path, table, **{"tunings": {"file": "tunings.csv"}, **json.loads(more)}))
     assert "\n" not in str(caught.value)

@@ -1,6 +1,7 @@
 """Twins whose model is an FMU: integrated as by SciPy, filtered as the same black box in Python, checked on load."""
 
 import gc
+import json
 import sys
 import zipfile
 from pathlib import Path
@@ -13,6 +14,7 @@ from app.twin.twin import load_twin
 from estimators.errors import NisusError
 from estimators.fold import fold
 from estimators.log import INPUT, READING, Events, Log
+from tests.cases import cases
 
 from .fmus import build
 
@@ -170,42 +172,13 @@ def test_events_act_at_the_ends_of_steps(tmp_path, version):
     )
 
 
-CO_SIMULATION = '<CoSimulation modelIdentifier="m" {}/>'
-
-
-@pytest.mark.parametrize(
-    ("given", "says"),
-    [
-        ({"flaw": "TIME"}, "its derivatives depend on time"),
-        ({"flaw": "MEMORY"}, "steps from one state differ and lacks canGetAndSetFMUstate"),
-        ({"flaw": "IGNORED"}, "setContinuousStates has no effect"),
-        ({"flaw": "OVERFLOW"}, "its derivatives at the start values are not finite"),
-        ({"kind": CO_SIMULATION.format("")},
-            "co-simulation only, without canGetAndSetFMUstate; export it for model ex"),
-        ({"kind": CO_SIMULATION.format('canGetAndSetFMUstate="true"')},
-            "co-simulation only, whose canGetAndSetFMUstate restores a state but cannot set"),
-        ({"kind": '<ModelExchange modelIdentifier="m" needsExecutionTool="true"/>'}, "needsExecutionTool"),
-        ({"kind": '<ModelExchange modelIdentifier="other"/>'}, "it cannot be loaded: Cannot find shared library"),
-    ],
-)  # fmt: skip
+@cases(__file__, "fmu_needs.csv")
 def test_what_a_filter_needs_is_checked_on_load(tmp_path, given, says):
-    said = refused(tmp_path, build(tmp_path, **given))
+    said = refused(tmp_path, build(tmp_path, **json.loads(given)))
     assert says in said and ".fmu: " in said
 
 
-@pytest.mark.parametrize(
-    ("old", "new", "says"),
-    [
-        ("car.v[1]", "car.v[2]",
-            "box.yaml:4: model.states.speed is 'car.v[2]', no continuous state of the FMU; did you"),
-        ("[mu]", "[nu]", "box.yaml:5: model.parameters.nu names 'nu', no real variable of the FMU"),
-        ("both: both}}", "both: bath}}", "box.yaml:6: model.sensors.pair names 'bath', no real variable of the FMU"),
-        ("  step: 0.02\n", "", "box.yaml:1: model.step is missing"),
-        ("FILE", "other.fmu", "box.yaml:2: model.fmu is 'other.fmu'; there is no file"),
-        ("{both: m}", "{bath: m}", "model.units names 'bath', no real variable"),
-        ("{speed:", "{x0:", "model.states gives two states one name"),
-    ],
-)  # fmt: skip
+@cases(__file__, "fmu_names.csv")
 def test_what_the_yaml_may_not_name(tmp_path, old, new, says):
     assert says in refused(tmp_path, build(tmp_path), FMU.replace(old, new))
 

@@ -1,6 +1,7 @@
 """One declared sensor of many landmarks: the same estimate as of a sensor for each, written by hand."""
 
 import dataclasses
+import json
 
 import numpy as np
 import pytest
@@ -17,6 +18,7 @@ from estimators.errors import EstimatorError, ModelError, NisusError
 from estimators.model.landmarks import with_landmarks
 from estimators.model.state_space import Parameter
 from estimators.models import MODELS
+from tests.cases import cases
 from tests.models import write_plant
 
 LANDMARKS = {6: (4.0, 1.0), 7: (-3.0, 5.0), 15: (1.0, -6.0)}
@@ -182,23 +184,10 @@ def test_one_line_names_a_column_for_each_member(tmp_path):
         np.testing.assert_array_equal(getattr(landmarks.track, name), getattr(run.track, name))
 
 
-@pytest.mark.parametrize(
-    ("overrides", "message"),
-    [
-        ({"sensors.sighting": "{std: 0.1}"}, "sensors.sighting has no landmarks; give them under sensors.sighting.at"),
-        ({"sensors.sighting.at": "{6: [1, 2, 3]}"}, "sighting_6: has 3 coordinates; sighting takes east, north"),
-        ({"sensors.sighting.at": "{a b: [1, 2]}"}, "the landmark 'a b' must consist of letters, digits and _"),
-        ({"source.sensors.sighting.by": "null"}, "has landmarks; name the column that tells them apart, by: COLUMN"),
-        ({"source.sensors.sighting": "{columns: ['r_*', b]}"}, "or columns of their own with * for the id"),
-        ({"source.sensors.sighting": "{columns: ['r_*', 'b_*']}"}, "there is no column 'r_6'"),
-        ({"source.sensors.sighting.by": "{id: {8: 3}}"}, "names the landmark '8'; sighting has 6, 7, 15"),
-        ({"source.inputs.speed.by": "id"}, "source.inputs.speed.by is for a sensor with landmarks"),
-        ({"use.sightin": "false"}, "did you mean use.sighting"),
-    ],
-)
+@cases(__file__, "wrong_landmarks.csv")
 def test_a_wrong_landmark_is_one_clear_line(folder, overrides, message):
     with pytest.raises(NisusError, match="^[^\n]*$") as error:
-        load_twin(folder / "one.yaml", overrides=overrides).check_files()
+        load_twin(folder / "one.yaml", overrides=json.loads(overrides)).check_files()
     assert message in str(error.value)
 
 

@@ -10,6 +10,7 @@ from estimators.fold import Fold, fold
 from estimators.forecast import forecast
 from estimators.log import READING, Log, truth_of
 from tests.app.twin.written import refusal, twin_of
+from tests.cases import cases
 
 pytestmark = pytest.mark.usefixtures("inside")
 
@@ -63,26 +64,7 @@ def test_a_time_may_have_a_unit(given, seconds):
     assert twin_of(LASTING.replace("40 s", given)).model.parameters[0].value == pytest.approx(seconds)
 
 
-@pytest.mark.parametrize(
-    ("old", "new", "words"),
-    [
-        ("40 s", "-40", "motor.yaml:3: noise.temperature.over is -40; it must be positive"),
-        ("40 s", "-40 s", "motor.yaml:3: noise.temperature.over is '-40 s'; it must be positive"),
-        ("40 s", "0", "motor.yaml:3: noise.temperature.over is 0; it must be positive"),
-        ("40 s", "40 m", "motor.yaml:3: noise.temperature.over is '40 m'; give seconds, or a number with one of ms, s, "
-            "min, h, d, as in 5 min"),
-        ("40 s", "[1, 2]", "motor.yaml:3: noise.temperature.over is [1, 2]; it must be a number"),
-        ("  temperature: {", "  temperatur: {",
-            "motor.yaml:3: noise.temperatur is no noise of motor_winding; did you mean temperature?"),
-        ("variance: 0.5", "variance: 0", "motor.yaml:3: noise.temperature.over: model motor_winding: noise temperature "
-            "has variance 0, so it cannot have a correlation time"),
-        ("{std: 2, over: 5 min}", "{std: 2}", "motor.yaml:6: sensors.winding.error.over is missing; add it"),
-        ("{std: 2, over: 5 min}", "{over: 5 min}",
-            "motor.yaml:6: sensors.winding.error gives neither variance nor std; add it"),
-        ("std: 2,", "std: -2,", "motor.yaml:6: sensors.winding.error.std is -2; it must be positive"),
-        ("std: 2,", "std: [1, 2],", "motor.yaml:6: sensors.winding.error.std has 2 entries; give one, or 1: winding"),
-    ],
-)  # fmt: skip
+@cases(__file__, "lasting.csv")
 def test_what_cannot_last_is_one_line_with_its_place(old, new, words):
     assert refusal(LASTING.replace(old, new)) == words
 

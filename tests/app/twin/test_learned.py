@@ -9,6 +9,7 @@ from app.twin.twin import load_twin
 from estimators.errors import ConfigError
 from estimators.models import MODELS
 from tests.app.twin.written import refusal, twin_of
+from tests.cases import cases
 
 pytestmark = pytest.mark.usefixtures("inside")
 
@@ -58,21 +59,7 @@ def test_a_twin_without_is_what_it_was():
     assert bare.model.f is alone.f and bare.model.Q is alone.Q and bare.model.noises == MODELS["motor_winding"].noises
 
 
-@pytest.mark.parametrize(
-    ("before", "after", "said"),
-    [
-        ("kind: gp", "kind: gpp", "correction.yaml:2: kind is 'gpp'; it must be 'gp', 'ridge' or 'net'"),
-        ("ratio: 1\n", "", "correction.yaml:1: the file is of kind gp and has no ratio; add it"),
-        ("lengths: [10]", "lengths: [10, 2]", "lengths has 2 numbers; it needs one for each of 1 features"),
-        ("[[20], [30], [40]]", "[[20], [30, 1], [40]]", "points has a row of 2 numbers; each needs 1"),
-        ("[[0.1], [0.2], [0.1]]", "[[0.1], [0.2]]", "rates has 2 rows; points has 3"),
-        ("noise: {temperature: 0.25}", "noise: {rate: 0.25}", "noise names rate; it must name each corrected state"),
-        ("model: motor_winding", "model: motor_drive", "learned.model is 'motor_drive'; that of motor is"),
-        ("features: [temperature]", "features: [temprature]", "has no state or input 'temprature'"),
-        ("lengths: [10]", "lengths: [0]", "correction.yaml:6: lengths[0] is 0; it must be positive"),
-        ("ratio: 1", "ratio: 1\nmore: 2", "more is not known"),
-    ],
-)
+@cases(__file__, "learned.csv")
 def test_what_is_wrong_has_its_line(before, after, said):
     assert before in RIGHT
     with pytest.raises(ConfigError) as caught:

@@ -1,6 +1,5 @@
 """Limits and ranges of validity as a twin's YAML says them: what they come to, what is refused, what is told of it."""
 
-import csv
 import json
 from pathlib import Path
 
@@ -20,10 +19,9 @@ from estimators.log import Log
 from estimators.model.parts import Limits, Stuck
 from estimators.tuning import Tuning
 from tests.app.twin.written import refusal, twin_of
+from tests.cases import cases
 
 pytestmark = pytest.mark.usefixtures("inside")
-
-WRONG = Path(__file__).with_name("limits.csv").open(encoding="utf-8")
 
 TWIN = """\
 model: motor_winding
@@ -71,10 +69,10 @@ def test_a_range_of_validity_takes_the_place_of_the_models():
     assert [state.fitted for state in model.states if state.name == "temperature"] == [(0.0, 150.0)]
 
 
-@pytest.mark.parametrize("row", [*csv.DictReader(WRONG, delimiter="\t", quoting=csv.QUOTE_NONE)])
-def test_what_means_nothing_is_refused_with_its_place(row):
-    with pytest.raises(ConfigError, match=row["said"]):
-        twin_of(limited(row["limits"].replace(r"\n", "\n"), row["more"]))
+@cases(__file__, "limits.csv")
+def test_what_means_nothing_is_refused_with_its_place(limits, more, said):
+    with pytest.raises(ConfigError, match=said):
+        twin_of(limited(limits, more))
 
 
 def test_a_quantum_says_nothing_of_a_sensor_without_noise():

@@ -10,6 +10,7 @@ from app.twin.twin import load_twin, restore_twin
 from estimators.compiled.model import compile_model
 from estimators.errors import ConfigError, ModelError
 from tests.app.twin.written import refusal, twin_of
+from tests.cases import cases
 
 pytestmark = pytest.mark.usefixtures("inside")
 
@@ -82,18 +83,7 @@ def test_overrides_set_the_tuning_and_the_yaml():
     assert twin.text == MOTOR
 
 
-@pytest.mark.parametrize(
-    ("key", "value", "expected"),
-    [
-        ("Q.temperature", "-1", "--set Q.temperature=-1: Q.temperature is -1; a variance must be zero or positive"),
-        ("R.winding", "big", "--set R.winding=big: R.winding must be a number"),
-        ("R.winding", "true", "--set R.winding=true: R.winding must be a number"),
-        ("use.winding", "0", "--set use.winding=0: use.winding must be true or false"),
-        ("use.winding", "[", "--set use.winding=[: use.winding must be true or false"),
-        ("gate", "3", "--set gate=3: gate is 3; it must be below 1"),
-        ("source.duration", "-1", "--set source.duration=-1: source.duration is -1; it must be positive"),
-    ],
-)
+@cases(__file__, "overrides.csv")
 def test_an_override_that_breaks_a_rule_is_one_line(key, value, expected):
     assert refusal(MOTOR, overrides={key: value}) == expected
 
@@ -105,27 +95,7 @@ def test_an_unknown_override_names_what_is_near():
     assert "; or a key of the YAML: name, title, teaches" in text and "\n" not in text
 
 
-@pytest.mark.parametrize(
-    ("old", "new", "expected"),
-    [
-        ("model: motor_winding", "model: motor_windin", "motor.yaml:1: model is 'motor_windin'; no model of that name ships; did you mean motor_winding "),
-        ("  temperature: {mean", "  temprature: {mean", "motor.yaml:3: prior.temprature is no state of motor_winding; did you mean temperature?"),
-        ("  rate: {std", "  heat: {std", "motor.yaml:5: noise.heat is no noise of motor_winding; choose from temperature, rate"),
-        ("  winding: {std: 3}", "  windin: {std: 3}", "motor.yaml:7: sensors.windin is no sensor of motor_winding; did you mean winding?"),
-        ("  winding: {std: 3}", "  winding: {std: [3, 4]}", "motor.yaml:7: sensors.winding.std has 2 entries; give one, or 1: winding"),
-        ("estimator: kf", "estimator: kff", "motor.yaml:8: estimator 'kff' does not exist; did you mean kf, ukf or ekf?"),
-        ("estimator: kf", "estimator: {name: ukf, options: {alfa: 1}}", "motor.yaml:8: estimator ukf has no option 'alfa'; did you mean alpha?"),
-        ("pairs: [[rate, temperature]]", "pairs: [[rate, temp]]", "motor.yaml:11: view.pairs[0] names 'temp', no state of motor_winding; did you mean temperature?"),
-        ("pairs: [[rate, temperature]]", "pairs: [[rate, rate]]", "motor.yaml:11: view.pairs[0] names rate twice; an ellipse needs two states"),
-        ("pairs: [[rate, temperature]]", "scene: {axes: [speed]}", "motor.yaml:11: view.scene.axes names 'speed', no state of motor_winding; choose from temperature, rate"),
-        ("pairs: [[rate, temperature]]", "scene: {beams: {scan: [0]}}", "motor.yaml:11: view.scene.beams names 'scan', no sensor of motor_winding; choose from winding"),
-        ("pairs: [[rate, temperature]]", "scene: {beams: {winding: [0, 1.57]}}", "motor.yaml:11: view.scene.beams.winding has 2 angles; winding has 1 rows, give one for each"),
-        ("pairs: [[rate, temperature]]", "scene: {beacons: {winding: [rate, mast]}}", "motor.yaml:11: view.scene.beacons.winding names 'mast', no state or parameter of motor_winding; choose from temperature, rate"),
-        ("initial: {rate: 0.2}", "initial: {speed: 1}", "motor.yaml:15: source.initial.speed is no state of motor_winding; choose from temperature, rate"),
-        ("initial: {rate: 0.2}", "inputs: {load: 1}", "motor.yaml:15: source.inputs.load is no input of motor_winding; there are none to choose from"),
-        ("model: motor_winding", "model: motor_winding\nparameters: {r: 1}", "motor.yaml:2: parameters.r is no parameter of motor_winding; there are none to choose from"),
-    ],
-)  # fmt: skip
+@cases(__file__, "lacks.csv")
 def test_what_the_model_lacks_is_one_line_with_what_is_near(old, new, expected):
     assert old in MOTOR
     text = refusal(MOTOR.replace(old, new, 1))

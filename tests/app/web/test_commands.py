@@ -1,6 +1,7 @@
 """Refused commands are answered in one line with value, rule and remedy, in terms of JSON."""
 
 import dataclasses
+import json
 import math
 import typing
 
@@ -11,6 +12,7 @@ from app.live.engine import Engine
 from app.twin.twin import load_twin
 from app.web.commands_json import command_from_json
 from estimators.errors import NisusError
+from tests.cases import cases
 
 KINDS = typing.get_args(commands.Command)
 ODD = (
@@ -34,44 +36,9 @@ def answer(engine, body):
     return str(refused.value)
 
 
-@pytest.mark.parametrize(
-    ("body", "line"),
-    [
-        ([], "the body is []; it must be like"),
-        ({}, "command is missing; choose from SetEstimator, "),
-        ({"command": None}, "command is null; choose from SetEstimator, "),
-        ({"command": "setTuning"}, "command is 'setTuning'; did you mean SetTuning or SetTunings?"),
-        ({"command": "SetTuning", "key": "gate"}, "SetTuning: value is missing; it takes key, value"),
-        ({"command": "SetTunings", "values": {}}, "SetTunings: values is empty; it takes the value of each key"),
-        ({"command": "SetTunings", "values": [1]}, "SetTunings: values is [1]; it must be an object of numbers"),
-        ({"command": "SetTunings", "values": {"Q.yoke": "x"}}, "SetTunings: values.Q.yoke is 'x'; it must be a number"),
-        ({"command": "SetTunings", "values": {"Q.yoke": 1, "R.yoke": -1}}, "R.yoke is -1; a variance must be positive"),
-        ({"command": "SetTuning", "kee": "gate", "value": 1}, "SetTuning: kee is not known; did you mean key?"),
-        ({"command": "SetTuning", "key": "gate", "value": "x"}, "gate is 'x'; it must lie between 0.5 and 1, or"),
-        ({"command": "SetTuning", "key": "gate", "value": "0.5"}, "gate is '0.5'; it must lie between 0.5 and 1"),
-        ({"command": "SetTuning", "key": "gate", "value": True}, "gate is true; it must lie between 0.5 and 1"),
-        ({"command": "SetTuning", "key": "gate.kind", "value": None}, "gate.kind is null; it must be hard or soft"),
-        ({"command": "SetTuning", "key": "gate.reopen", "value": "x"}, "gate.reopen is 'x'; it must be a positive"),
-        ({"command": "SetTuning", "key": "Q.yoke", "value": "x"}, "Q.yoke is 'x'; it must be a finite number"),
-        ({"command": "SetTuning", "key": "use.yoke", "value": "no"}, "use.yoke is 'no'; it must be true or false"),
-        ({"command": "SetTuning", "key": "gate", "value": None, "gesture": "g" * 65}, "gesture has 65 charac"
-         "ters; it may have 64"),
-        ({"command": "SetTuning", "key": "", "value": 1}, "'' is not a tuning key of motor_drive; choose from"),
-        ({"command": "SetOption", "name": "jozeph", "value": 1}, "no option 'jozeph'; did you mean joseph?"),
-        ({"command": "UseSensor", "name": "yok", "used": False}, "UseSensor: name is 'yok', no sensor of motor_drive"),
-        ({"command": "Annotate", "text": "x"}, "Annotate: no measurement has arrived yet; wait for the first"),
-        ({"command": "Annotate", "text": 1}, "Annotate: text is 1; it must be a text"),
-        ({"command": "Pause", "paused": None}, "Pause: paused is null; it must be true or false"),
-        ({"command": "Reset", "now": 1}, "Reset: now is not known; it takes no field"),
-        ({"command": "InjectFault", "kind": "bias", "target": "parameter.x", "size": 1}, "target is 'parameter.x', no"),
-        ({"command": "InjectFault", "kind": "noise", "target": "yoke", "size": 1e300}, "size is 1e+300; it must be posi"
-         "tive, and 1e+50 at most"),
-        ({"command": "InjectFault", "kind": "duplicate", "count": 10**30}, "count is too large; it must be below 2^53"),
-    ],
-    ids=str,
-)  # fmt: skip
+@cases(__file__, "refused_commands.csv")
 def test_a_command_that_cannot_be_says_why(engine, body, line):
-    said = answer(engine, body)
+    said = answer(engine, json.loads(body))
     assert line in said and "\n" not in said
 
 

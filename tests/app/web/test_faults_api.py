@@ -11,6 +11,7 @@ from sources.faults.kinds import KINDS
 from sources.faults.layer import Faults, FaultySource
 from tests.app.scripted import MODEL, pull_all, readings
 from tests.app.web.test_bounds import NASTY
+from tests.cases import cases
 from tests.support import SECOND
 from tests.waiting import wait_for
 
@@ -80,28 +81,9 @@ def test_the_catalogue_says_what_a_kind_takes(page):
     }  # fmt: skip
 
 
-@pytest.mark.parametrize(
-    ("body", "says"),
-    [
-        ({"kind": "bend", "target": "winding"}, "InjectFault: kind is 'bend'; "),
-        ({"kind": "bias", "target": "windin", "size": 1}, "InjectFault: target is 'windin', no sensor or input of"),
-        ({"kind": "bias", "target": "winding"}, "InjectFault: size is missing; a fault of kind bias needs it"),
-        ({"kind": "bias", "size": 1}, "InjectFault: target is missing; a fault of kind bias needs the name"),
-        ({"kind": "stuck", "target": "winding", "size": 1}, "size is not used by a fault of kind stuck"),
-        ({"kind": "spike", "target": "winding", "size": 1, "rate": 2}, "rate is 2; it is a probability"),
-        ({"kind": "delay", "size": 1e30}, "size is 1e+30; it must be positive, and 1e+06 s at most"),
-        ({"kind": "duplicate", "count": 0}, "count is 0; it must be a whole number from 1 to 1000"),
-        ({"kind": "stuck", "target": "winding", "row": "top"}, "row is 'top', no row of winding"),
-        ({"kind": "stuck", "target": "winding", "duration": -1}, "duration is -1 s; it must be positive"),
-        ({"kind": "model", "target": "winding", "size": 2}, "no parameter of motor_winding; there is none"),
-        ({"kind": "swap", "target": "winding", "other": "winding"}, "other is 'winding'; it must be another sensor"),
-        ({"kind": "bias", "sensor": "winding"}, "sensor is not known; choose from kind, target"),
-        ({}, "kind is missing; it takes kind, target"),
-    ],
-    ids=str,
-)
+@cases(__file__, "refused_faults.csv")
 def test_a_fault_that_cannot_be_is_one_line(page, body, says):
-    answer = ask(page, command="InjectFault", **body)
+    answer = ask(page, command="InjectFault", **json.loads(body))
     assert answer.status == 400
     text = json.loads(answer.text)["error"]
     assert says in text and "\n" not in text

@@ -12,6 +12,7 @@ from app.twin.twin import load_twin
 from app.web.commands_json import command_from_json
 from config.loader import TWINS
 from estimators.errors import NisusError
+from tests.cases import cases
 from tests.waiting import LIMIT_S, wait_for
 
 DONE = ("done", "failed", "cancelled")
@@ -56,24 +57,9 @@ def test_a_stopped_fit_keeps_its_best_values(page, halted):
     assert told["state"] == "done" and told["result"]["stopped"] and told["values"]
 
 
-@pytest.mark.parametrize(
-    ("path", "body", "reason"),
-    [
-        ("/api/fit", [], "it must be an object of wanted, events"),
-        ("/api/fit", {"wanted": "Q"}, "wanted is 'Q'; it must be a list of texts"),
-        ("/api/fit", {"wanted": ["Q"], "more": 1}, "more is not known; choose from wanted, events"),
-        ("/api/fit", {"wanted": []}, "wanted is empty"),
-        ("/api/fit", {"wanted": ["Q"], "events": 0}, "events is 0; it must be a positive whole number"),
-        ("/api/fit", {"wanted": ["Q"], "events": True}, "events is true; it must be a whole number"),
-        ("/api/refit/accept", {"number": 7}, "refit 7: it is not known"),
-        ("/api/refit/dismiss", {"number": 7}, "refit 7: it is not known"),
-        ("/api/refit/accept", {"number": "1"}, "number is '1'; it must be a whole number"),
-        ("/api/refit/accept", {}, "number is missing"),
-        ("/api/refit", {"entries": []}, "entries is not known; it takes no field"),
-    ],
-)
+@cases(__file__, "refused_fits.csv")
 def test_what_is_refused(page, path, body, reason):
-    answer = page.client.post(path, body)
+    answer = page.client.post(path, json.loads(body))
     assert answer.status == 400 and reason in json.loads(answer.text)["error"]
 
 

@@ -1,5 +1,6 @@
 """Runs and tuning versions over HTTP: list, pin, name, load, compare, keep, save, refuse."""
 
+import json
 import shutil
 
 import numpy as np
@@ -14,6 +15,7 @@ from config.loader import TWINS
 from estimators.fold import Fold
 from estimators.tuning import Tuning
 from tests.app.scripted import MODEL
+from tests.cases import cases
 from tests.waiting import wait_for
 
 FIRST = Tuning.of(MODEL)
@@ -159,21 +161,8 @@ def test_a_run_is_kept_and_loaded_again(twin_page, tmp_path):
     assert twin_page.engine.status().tuning.name == "own" and twin_page.engine.status().tuning.get("R.winding") == 4.0
 
 
-@pytest.mark.parametrize(
-    ("path", "fields", "said"),
-    [
-        ("/api/tunings", {"run": 0, "name": "own", "note": ""}, "the version's name is 'own'; use letters"),
-        ("/api/tunings", {"run": 0, "name": "../a", "note": ""}, "the version's name is '../a'; use letters"),
-        ("/api/tunings", {"run": 7, "name": "a", "note": ""}, "run 7 is not known"),
-        ("/api/tunings", {"run": True, "name": "a", "note": ""}, "run is true; it must be a whole number"),
-        ("/api/tunings", {"run": 0, "name": "a"}, "note is missing; it takes run, name, note"),
-        ("/api/tunings", {"run": 0, "name": "a", "note": "x" * 2001}, "note: it has 2001 characters; it may have 2000"),
-        ("/api/tunings/load", {"name": "nobody"}, "--tuning nobody: winding has no such version"),
-        ("/api/tunings/load", {"name": "/etc/passwd"}, "/etc/passwd: no version is read from there"),
-        ("/api/tunings/load", {"name": 3}, "name is 3; it must be a text"),
-    ],
-)
+@cases(__file__, "refused_versions.csv")
 def test_what_is_refused_of_versions(twin_page, path, fields, said):
-    status, answer = twin_page.post(path, **fields)
+    status, answer = twin_page.post(path, **json.loads(fields))
     assert status == 400 and said in answer["error"]
     assert len(tunings(twin_page)["versions"]) == 1 and twin_page.engine.status().tuning.name == "own"

@@ -1,11 +1,9 @@
 """Blocks of a BLF log: the same frames as python-can's own reader, message by message."""
 
-import csv
 import re
 import struct
 import zlib
 from collections import Counter
-from pathlib import Path
 
 import can
 import numpy as np
@@ -13,6 +11,7 @@ import pytest
 
 from sources.can.blf import BlfBlocks
 from sources.can.readers import LogSummary, _columns, _correct_readers, read_messages
+from tests.cases import cases
 
 START = 1_700_000_000.0
 
@@ -107,18 +106,18 @@ def test_headers_times_and_data_that_looks_like_an_object(tmp_path, version, fla
     check(objects(tmp_path / "d.blf", [*records, (1, version, flags, 2**60 + 1, frame(data=b"12345678"))]))
 
 
-@pytest.mark.parametrize("row", [*csv.DictReader(Path(__file__).with_name("damaged_blocks.csv").open(), delimiter=";")])
-def test_a_damaged_block_loses_only_itself(tmp_path, row):
+@cases(__file__, "damaged_blocks.csv")
+def test_a_damaged_block_loses_only_itself(tmp_path, begin, end, written, lost, fault):
     """Of the blocks of 2048 bytes and frames of 48 each, the fourth has frames 128 to 170 wholly or in part."""
     path = write(tmp_path / "a.blf", [message(k) for k in range(500)])
     data = bytearray(path.read_bytes())
     at = [block.start() for block in re.finditer(rb"LOBJ.{8}\n\0{3}", data, re.DOTALL)][3]
-    data[at + int(row["from"]) : at + int(row["to"])] = bytes.fromhex(row["bytes"])
+    data[at + int(begin) : at + int(end)] = bytes.fromhex(written)
     path.write_bytes(data)
     (t, *_), _, summary, _ = read(path, None, 8)
-    expected = np.delete(np.arange(500), np.arange(*map(int, row["lost"].split())))
+    expected = np.delete(np.arange(500), np.arange(*map(int, lost.split())))
     np.testing.assert_array_equal(np.round((t * 1e-9 - START) / 0.001234567), expected)
-    assert summary.fault.replace(str(at), "AT").startswith(row["fault"])
+    assert summary.fault.replace(str(at), "AT").startswith(fault)
 
 
 def test_bytes_between_objects(tmp_path):

@@ -1,8 +1,5 @@
 """Decoding equals cantools' own, on random layouts and payloads; what does not decode is counted."""
 
-import csv
-from pathlib import Path
-
 import can
 import cantools
 import numpy as np
@@ -12,6 +9,7 @@ from estimators.errors import SourceError
 from estimators.log import INPUT, READING, TRUTH
 from sources.can.decoder import Decoder, ends_of
 from sources.source import Accuracy, Channel, Condition
+from tests.cases import cases
 from tests.sources.can.can_tools import DBC, Reports, dbc, frame, sensor
 
 
@@ -319,16 +317,18 @@ def test_an_accuracy_of_another_dimension_is_refused(tmp_path):
         Decoder([(dbc(tmp_path), None)], [fix], width=1)
 
 
-@pytest.mark.parametrize("row", [*csv.DictReader(Path(__file__).with_name("limits.csv").open(), delimiter=";")])
-def test_values_that_the_dbc_or_j1939_excludes_are_missing_and_named(tmp_path, row):
-    lines = [f'BO_ 2147484160 A: 8 E\n SG_ S : 0|{row["layout"]} {row["limits"]} "" E']
-    lines += [f"VAL_ 2147484160 S {row['names']} ;"] * bool(row["names"])
-    lines += ['BA_DEF_ "ProtocolType" STRING ;', 'BA_ "ProtocolType" "J1939";'] * bool(row["j1939"])
+@cases(__file__, "limits.csv")
+def test_values_that_the_dbc_or_j1939_excludes_are_missing_and_named(
+    tmp_path, layout, limits, names, j1939, raw, value, why, ends
+):
+    lines = [f'BO_ 2147484160 A: 8 E\n SG_ S : 0|{layout} {limits} "" E']
+    lines += [f"VAL_ 2147484160 S {names} ;"] * bool(names)
+    lines += ['BA_DEF_ "ProtocolType" STRING ;', 'BA_ "ProtocolType" "J1939";'] * bool(j1939)
     path, reports = dbc(tmp_path, "\n".join(lines) + "\n"), Reports()
     channel = sensor(0, "A", "S", scale=(0.5,), offset=(1.0,))
-    assert ends_of([(path, None)], channel) == (tuple(0.5 * float(end) + 1.0 for end in row["ends"].split()),)
+    assert ends_of([(path, None)], channel) == (tuple(0.5 * float(end) + 1.0 for end in ends.split()),)
     decoder = Decoder([(path, None)], [channel], width=1, report=reports)
-    data = int(row["raw"]).to_bytes(8, "little")
-    (value,) = decoder.decode(decoder.gather([frame(512, data, extended=True)], None)).value[:, 0]
-    np.testing.assert_equal(value, 0.5 * float(row["value"] or "nan") + 1.0)
-    assert reports.counts["no value A.S"] == (not row["value"]) and row["why"] in str(reports.texts)
+    data = int(raw).to_bytes(8, "little")
+    (found,) = decoder.decode(decoder.gather([frame(512, data, extended=True)], None)).value[:, 0]
+    np.testing.assert_equal(found, 0.5 * float(value or "nan") + 1.0)
+    assert reports.counts["no value A.S"] == (not value) and why in str(reports.texts)

@@ -1,10 +1,8 @@
 """Tables: columns to events, times exact, and every complaint with its file and line."""
 
-import csv
 import json
 from collections import Counter
 from datetime import UTC, datetime, timedelta, timezone
-from pathlib import Path
 from zoneinfo import ZoneInfo
 
 import numpy as np
@@ -20,6 +18,7 @@ from sources.source import UNDATED, Channel, Condition
 from sources.tables.table import Table
 from sources.tables.text import TextMatch
 from sources.tables.times import ASSUMED, SKIPPED, TWICE, TimeColumn, TimeReader
+from tests.cases import cases
 from tests.sources.can.can_tools import Reports, same
 from tests.support import read_all
 
@@ -31,7 +30,6 @@ CHANNELS = (
 )
 HEADER = "t,temp,a,b,ok,power,x\n"
 NAN = float("nan")
-TIMES = Path(__file__).with_name("times.csv").open()
 
 
 def write(folder, text, name="drive.csv"):
@@ -178,15 +176,15 @@ def test_what_is_quoted_from_a_file_is_escaped_and_cut(tmp_path):
     assert text.startswith("drive.csv:2: temp is '\\x9b31m999") and text.isprintable() and len(text) < 150
 
 
-@pytest.mark.parametrize("row", [*csv.DictReader(TIMES, delimiter="\t", quoting=csv.QUOTE_NONE)])
-def test_times_are_exact(tmp_path, row):
+@cases(__file__, "times.csv")
+def test_times_are_exact(tmp_path, file, rows, options, assumed, ns):
     """2020-10-25T01:00Z is 1,603,587,600 s, and 2024-03-04 1,709,510,400 s (date -u +%s); a clock passes midnight."""
-    rows, expected, reports = row["rows"].split("|"), [int(t) for t in row["ns"].split()], Reports()
+    rows, expected, reports = rows.split("|"), [int(t) for t in ns.split()], Reports()
     names = ["t", "u"][: rows[0].count(";") + 1]
-    path = write(tmp_path, "".join([";".join(names), ";x\n", *(f"{cells};1\n" for cells in rows)]), row["file"])
-    options = {"time_unit": "s", **json.loads(row["options"])}
+    path = write(tmp_path, "".join([";".join(names), ";x\n", *(f"{cells};1\n" for cells in rows)]), file)
+    options = {"time_unit": "s", **json.loads(options)}
     got = read_all(Table([path], time_column=names, channels=X, width=1, report=reports, **options))
-    counts = {UNDATED: len(rows) - len(expected), ASSUMED: int(row["assumed"])}
+    counts = {UNDATED: len(rows) - len(expected), ASSUMED: int(assumed)}
     assert (got.t.tolist(), reports.counts) == (expected, {key: count for key, count in counts.items() if count})
 
 
