@@ -68,56 +68,15 @@ def test_a_missing_type_is_told_those_of_the_schema(monkeypatch):
     assert message(untyped) == known
 
 
-@pytest.mark.parametrize(
-    ("text", "expected"),
-    [
-        ("", "motor.yaml:1: the file is empty; a twin needs at least model and source"),
-        ("# only a comment\n", "motor.yaml:1: the file is empty; a twin needs at least model and source"),
-        ("- a\n", "motor.yaml:1: the file is ['a']; it must be a mapping of keys and values"),
-        ("just text\n", "motor.yaml:1: the file is 'just text'; it must be a mapping of keys and values"),
-        ("model: a\nsource: b: c\n", "motor.yaml:2: not valid YAML: mapping values are not allowed here; check "
-            "indentation, quotes and brackets"),
-        ("model: [a\n", "motor.yaml:2: not valid YAML: expected ',' or ']', but got '<stream end>'; check indentation, "
-            "quotes and brackets"),
-        ("model: a\ngate: 0.9\nmodel: b\n", "motor.yaml:3: model is given twice, first in line 1; remove one"),
-        ("model: &a [*a]\n", "motor.yaml:1: it contains itself through an alias (*name); write the value out"),
-        ("[" * 5000, "motor.yaml:1: it is nested too deeply; a twin needs six levels"),
-        ("model: a\n? [1]\n: 2\n", "motor.yaml:2: a key must be one word, not a list or mapping; put braces in quotes"),
-        ("model: !car x\n", "motor.yaml:1: the tag !car has no meaning here; remove it"),
-        ("model: !!python/name:os.system ''\n",
-            "motor.yaml:1: the tag tag:yaml.org,2002:python/name:os.system has no meaning here; remove it"),
-        ("model: a\ntitle: '\x01'\n", "motor.yaml:2: the character '\\x01' is not text; remove it"),
-        ("model: a\n---\nmodel: b\n", "motor.yaml:2: not valid YAML: a second document begins here (---); check "
-            "indentation, quotes and brackets"),
-    ],
-)  # fmt: skip
+@cases(__file__, "no_twins.csv")
 def test_what_is_not_a_twin_at_all_is_one_line(text, expected):
     assert message(text) == expected
 
 
-@pytest.mark.parametrize(
-    ("more", "expected"),
-    [
-        ("time: {degraded_after: 20}",
-            "motor.yaml:14: time.stale_after is 15.0 s; it must not be below degraded_after (20.0 s)"),
-        ("view: {scene: {kind: vehicle}}", "motor.yaml:14: view.scene is a vehicle and has no position; add it"),
-        ("view: {pairs: [[a]]}", "motor.yaml:14: view.pairs[0] is ['a']; it needs 2 or more entries"),
-        ("name: my motor",
-            "motor.yaml:14: name is 'my motor'; use letters, digits, _ and -, and begin with a letter or digit"),
-        ("history: 2.5", "motor.yaml:14: history is 2.5; it must be a whole number"),
-        ("prior: {a: {std: -1}}", "motor.yaml:14: prior.a.std is -1; it must be zero or positive"),
-    ],
-)  # fmt: skip
-def test_settings_that_contradict_each_other_are_one_line(more, expected):
-    assert message(MOTOR + more) == expected
-
-
-@pytest.mark.parametrize("repeat", ["{steps: [[0, 1], [5, 2]], repeat: 5}", "{constant: 1, repeat: 5}"])
-def test_a_profile_that_cannot_repeat_is_one_line(repeat):
-    text = MOTOR.replace("{steps: [[0, 1], [5, 2]]}", repeat)
-    assert message(text) == (
-        "motor.yaml:13: source.inputs.torque[1].repeat is 5.0 s; it needs steps that all begin before it"
-    )
+def test_a_text_too_deep_or_with_characters_that_are_none_is_one_line():
+    assert message("[" * 5000) == "motor.yaml:1: it is nested too deeply; a twin needs six levels"
+    said = "motor.yaml:2: the character '\\x01' is not text; remove it"
+    assert message("model: a\ntitle: '\x01'\n") == said
 
 
 def test_one_mistake_is_one_line_though_it_breaks_several_rules():
