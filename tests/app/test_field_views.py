@@ -53,7 +53,6 @@ view:
   window: 12
   picture: 2
 """
-SHAPE = (8, 12)
 
 
 @pytest.fixture(scope="module")

@@ -1,5 +1,7 @@
 """The tuning: frozen, versioned, and one line for whatever is wrong."""
 
+import json
+
 import numpy as np
 import pytest
 
@@ -7,6 +9,7 @@ from estimators.errors import ConfigError
 from estimators.model.state_space import Parameter, StateSpaceModel
 from estimators.models import MODELS
 from estimators.tuning import Tuning
+from tests.cases import cases
 from tests.estimators.interpreted.test_filterpy import PENDULUM
 
 MOTOR = MODELS["motor_winding"]
@@ -46,26 +49,10 @@ def test_versions_never_repeat():
     assert tuning.with_options({"alpha": 0.5}).version > versions[-1]
 
 
-@pytest.mark.parametrize(
-    ("key", "value", "says"),
-    [
-        ("Q.temperature", -0.1, "Q.temperature is -0.1; a variance must be zero or positive"),
-        ("R.winding", 0.0, "R.winding is 0; a variance must be positive"),
-        ("R.winding", np.nan, "R.winding is nan; it must be a finite number"),
-        ("R.winding", np.inf, "R.winding is inf; it must be a finite number"),
-        ("R.winding", None, "R.winding is null; it must be a finite number"),
-        ("gate", 1.0, "gate is 1; it must lie between 0.5 and 1"),
-        ("gate", -2, "gate is -2; it must lie between 0.5 and 1"),
-        ("gate", np.nan, "gate is nan; it must lie between 0.5 and 1"),
-        ("R.windng", 1.0, "R.windng is not a tuning key of motor_winding; did you mean R.winding"),
-        ("Q.winding", 1.0, "Q.winding is not a tuning key of motor_winding; did you mean R.winding"),
-        ("nonsense", 1.0, "nonsense is not a tuning key"),
-        ("", 1.0, "not a tuning key"),
-    ],
-)
+@cases(__file__, "wrong_tunings.csv")
 def test_what_is_wrong_is_one_line(key, value, says):
     with pytest.raises(ConfigError) as refused:
-        Tuning.of(MOTOR).set(key, value)
+        Tuning.of(MOTOR).set(key, json.loads(value))
     assert says in str(refused.value)
     assert "\n" not in str(refused.value)
 

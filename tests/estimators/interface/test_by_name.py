@@ -1,5 +1,6 @@
 """The interface by name: the same fold beneath, errors that say what to write, and scores against their definitions."""
 
+import json
 import subprocess
 import sys
 from concurrent.futures import ThreadPoolExecutor
@@ -17,6 +18,7 @@ from estimators.model.assemble import JointParameter, joint
 from estimators.models.uwb_rover import HEADING, YAW_RATE_BIAS
 from estimators.track import HELD_OUT, USED
 from estimators.tuning import Tuning
+from tests.cases import cases
 from tests.models import unchanged
 from tests.support import SECOND, assert_same, folded, log_of
 
@@ -85,61 +87,31 @@ def test_truth_of_far_apart_states_of_a_field_is_told_in_blocks():
     np.testing.assert_array_equal(np.sort(log.events.value[np.isfinite(log.events.value)]), [1.0, 3.0, 9.0])
 
 
-WRONG = {
-    "a sensor": (lambda log: log.add("windng", 1.0, 2.0), "no sensor 'windng'; did you mean winding"),
-    "an input": (lambda log: log.add_inputs(1.0, speed=2.0), "motor_winding has no input 'speed'; there are none"),
-    "no input": (lambda log: log.add_inputs(1.0), "no input is given; there are none"),
-    "a state": (lambda log: log.add_truth(1.0, temperatur=2.0), "no state 'temperatur'; did you mean temperature"),
-    "values": (
-        lambda log: log.add("winding", [1.0, 2.0], [1.0]),
-        "have shape .1,. for 2 times; the shape must be .2,.",
-    ),
-    "columns": (lambda log: log.add("winding", [1.0], [[1.0, 2.0]]), "the shape must be .1,."),
-    "a word": (lambda log: log.add("winding", [1.0], ["warm"]), "'warm'; all entries must be numbers"),
-    "a time": (lambda log: log.add("winding", [1.0, np.nan], [1.0, 2.0]), r"seconds\[1\] is nan"),
-    "nanoseconds": (lambda log: log.add("winding", 1_700_000_000 * 10**9, 1.0), "in seconds"),
-    "times": (lambda log: log.add("winding", [[1.0]], [1.0]), "seconds has shape .1, 1."),
-    "a variance": (lambda log: log.add("winding", 1.0, 2.0, variance=0.0), "variance of winding is 0; it must be"),
-    "variances": (lambda log: log.add("winding", 1.0, 2.0, variance=[1.0, 2.0]), "variance of winding has shape"),
-    "R by itself": (
-        lambda log: fold("kf", MOTOR, log, R=9.0),
-        "R is 9.0; it must be given by name, such as {'winding'",
-    ),
-    "a name of R": (lambda log: fold("kf", MOTOR, log, R={"windng": 9.0}), "did you mean R.winding"),
-    "many of R": (lambda log: fold("kf", MOTOR, log, R={"winding": [1, 2]}), r"R\['winding'\] has shape .2,."),
-    "R of zero": (lambda log: fold("kf", MOTOR, log, R={"winding": 0.0}), "a variance must be positive"),
-    "a held out name": (lambda log: fold("kf", MOTOR, log, held_out="gnss"), "use.gnss"),
-    "a filter": (lambda log: fold("ufk", MOTOR, log), "did you mean ukf"),
-    "an option": (lambda log: fold("ukf", MOTOR, log, alhpa=0.5), "no option 'alhpa'; did you mean alpha?"),
-    "a word for an option": (
-        lambda log: fold("pf", MOTOR, log, resampling="stratifed"),
-        "resampling is 'stratifed'; it must be one of .*stratified",
-    ),
-    "a word for a number": (
-        lambda log: fold("ukf", MOTOR, log, alpha="small"),
-        "alpha is 'small'; it must be a number",
-    ),
-    "nothing for an option": (lambda log: fold("ukf", MOTOR, log, alpha=None), "alpha is None; it must be a number"),
-    "a seed": (lambda log: fold("pf", MOTOR, log, seed=1.5), "seed is 1.5; it must be a whole number"),
-    "a negative seed": (lambda log: fold("pf", MOTOR, log, seed=-1), "seed is -1"),
-    "a log of another model": (
-        lambda log: fold("ekf", ROAD, log),
-        "the log is of motor_winding, with the sensors winding; road_car has",
-    ),
-    "an executor": (lambda log: fold_many("kf", MOTOR, log, executor="cloud"), "executor is 'cloud'; it must be"),
-    "NEES without covariances": (lambda log: fold("kf", MOTOR, log).nees(), "covariance=True"),
-    "NEES without truth": (lambda log: fold("kf", MOTOR, log, covariance=True).nees(), "log.add_truth"),
-}
+def assert_refused(log, says, call, *given, **named):
+    with pytest.raises(NisusError, match=says) as told:
+        call(*given, **named)
+    assert "\n" not in str(told.value) and log.n == 5
 
 
-@pytest.mark.parametrize("name", WRONG)
-def test_errors_say_what_to_write(name):
-    call, text = WRONG[name]
+@cases(__file__, "refused_events.csv")
+def test_events_that_do_not_fit_are_told_what_to_write(method, given, named, says):
     log = motor_log()
-    with pytest.raises(NisusError, match=text) as told:
-        call(log)
-    assert "\n" not in str(told.value)
-    assert log.n == 5
+    assert_refused(log, says, getattr(log, method), *json.loads(given), **json.loads(named))
+
+
+@cases(__file__, "refused_folds.csv")
+def test_settings_that_do_not_fit_are_told_what_to_write(estimator, named, says):
+    log = motor_log()
+    assert_refused(log, says, fold, estimator, MOTOR, log, **json.loads(named))
+
+
+def test_what_does_not_fit_the_log_is_told_what_to_write():
+    log = motor_log()
+    other = "the log is of motor_winding, with the sensors winding; road_car has"
+    assert_refused(log, other, fold, "ekf", ROAD, log)
+    assert_refused(log, "executor is 'cloud'; it must be", fold_many, "kf", MOTOR, log, executor="cloud")
+    assert_refused(log, "covariance=True", fold("kf", MOTOR, log).nees)
+    assert_refused(log, "log.add_truth", fold("kf", MOTOR, log, covariance=True).nees)
 
 
 def test_a_log_of_no_model_knows_no_names():
