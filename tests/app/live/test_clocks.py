@@ -15,6 +15,7 @@ from estimators.log import MAINTENANCE
 from estimators.track import STALE, WAITING
 from sources.source import WRONG_TIME
 from tests.app.scripted import MODEL, Scripted, Stepped, pull_all, readings, row_count, twin
+from tests.cases import cases
 from tests.support import SECOND
 
 T = np.arange(1.0, 301.0)
@@ -126,21 +127,10 @@ def test_maintenance_is_an_event_of_the_log(live):
     assert line.text.startswith("maintenance: bearing replaced; rate as uncertain") and line.t == 100 * SECOND
 
 
-@pytest.mark.parametrize(
-    ("what", "states", "text"),
-    [
-        ("", ["rate"], "describe the change"),
-        ("a\nb", ["rate"], "describe the change"),
-        ("x" * 201, ["rate"], "in 1 to 200 characters"),
-        ("new fan", [], "name the states"),
-        ("new fan", ["ratte"], "did you mean rate"),
-        ("new fan", ["rate", "rate"], "name each once"),
-        ("new fan", "rate", "must be a list of texts"),
-    ],
-)
+@cases(__file__, "refused_maintenance.csv")
 def test_maintenance_that_cannot_be_is_refused_with_the_reason(live, what, states, text):
     with pytest.raises(ConfigError, match=text):
-        command_from_json({"command": "Maintenance", "what": what, "states": states}, live.engine)
+        command_from_json({"command": "Maintenance", "what": what, "states": json.loads(states)}, live.engine)
 
 
 def test_planned_maintenance_comes_when_its_time_has_come():

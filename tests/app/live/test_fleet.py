@@ -34,6 +34,7 @@ from tests import ROOT
 from tests.app.cli.test_fleet import FLEET, write
 from tests.app.outputs.broker import Broker, Listener
 from tests.benchmarks.kills import FleetRun, survive_fleet
+from tests.cases import cases
 from tests.skips import program
 from tests.waiting import LIMIT_S, wait_for
 
@@ -245,18 +246,10 @@ def test_the_asset_is_a_level_of_the_topic(tmp_path, group):
     broker.stop()
 
 
-@pytest.mark.parametrize(
-    ("topics", "text"),
-    [
-        ({"plant/+/t": "winding"}, "one of its levels must be {asset}"),
-        ({"{asset}/{asset}": "winding"}, "one of its levels must be {asset}"),
-        ({"a/{asset}/+": "winding", "a/+/{asset}": "winding"}, "has a/+/+ twice"),
-        ({"a/{asset}/x#": "winding"}, "+ and # must stand alone"),
-    ],
-)
+@cases(__file__, "fleet_topics.csv")
 def test_topics_that_do_not_name_an_asset_are_one_line(topics, text, tmp_path):
     with pytest.raises(NisusError) as caught:
-        running(tmp_path, {"type": "mqtt", "host": "127.0.0.1", "port": 1, "topics": topics})
+        running(tmp_path, {"type": "mqtt", "host": "127.0.0.1", "port": 1, "topics": json.loads(topics)})
     assert text in str(caught.value) and "\n" not in str(caught.value) and "pumps.yaml:1" in str(caught.value)
 
 

@@ -20,6 +20,7 @@ from app.twin.twin import load_twin
 from app.views.recording.rrd_file import Split, parse_split
 from app.web.running import OpenedTwin, RunningTwin
 from tests.app.scripted import Scripted, random_walk, readings
+from tests.cases import cases
 
 OWN = ["twin", "revision", "row", "archived_ns"]
 MIDNIGHT = 1_700_006_400  # s
@@ -242,17 +243,7 @@ def test_query_prints_a_table_json_or_csv(archive, capsys):
     assert len(capsys.readouterr().out.splitlines()) == 1 + len(expected)
 
 
-@pytest.mark.parametrize(
-    ("sql", "text"),
-    [
-        ("SELECT * FROM read_csv('/etc/passwd')", "Permission Error"),
-        ("COPY (SELECT 1) TO '%s/x.csv'", "must be one SELECT statement"),
-        ("SELECT 1; DROP VIEW winding", "must be one SELECT statement"),
-        ("SELECT 1 FROM windin", "winding"),
-        ("SELEC", "syntax error"),
-        ("", "must be one SELECT statement"),
-    ],
-)
+@cases(__file__, "queries.csv")
 def test_query_only_reads_the_archive(archive, capsys, sql, text):
     assert main(["query", str(archive), sql % archive if "%" in sql else sql]) == 2
     lines = capsys.readouterr().err.splitlines()

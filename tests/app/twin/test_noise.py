@@ -20,6 +20,7 @@ from estimators.fold import fold
 from estimators.log import READING, TRUTH, Log
 from estimators.models import MODELS
 from tests.app.twin.written import refusal, twin_of
+from tests.cases import cases
 
 ROVER = """\
 model: pair.py:Pair
@@ -97,18 +98,7 @@ def test_the_simulated_sensor_is_correlated_too():
     assert len(said) == 400 and abs(c + 0.9) < 5 * (1 - 0.9**2) / np.sqrt(400)
 
 
-@pytest.mark.parametrize(
-    ("matrix", "expected"),
-    [
-        ("[[1, 0.5]]", "has 1 rows of 2; it must be 2 × 2"),
-        ("[[1, 0.5], [1]]", "has 2 rows of 2, 1; it must be 2 × 2"),
-        ("[[1]]", "has 1 rows of 1; it must be 2 × 2"),
-        ("[[1, 0.5], [0.4, 1]]", "is not symmetric; fill both triangles alike"),
-        ("[[2, 0.5], [0.5, 1]]", "must be finite, with ones on its diagonal; of a covariance R give R_ij / √(R_ii R_jj)"),  # noqa: E501
-        ("[[1, 1.5], [1.5, 1]]", "is not positive definite (smallest eigenvalue -0.5); lessen the correlations"),  # noqa: E501
-        ("[[1, 1], [1, 1]]", "is not positive definite (smallest eigenvalue 0); leave out rows that repeat others"),
-    ],
-)  # fmt: skip
+@cases(__file__, "correlations.csv")
 def test_a_correlation_that_is_none_is_one_line(matrix, expected):
     assert refusal(correlated(matrix)) == f"motor.yaml:3: sensors.fix.correlation {expected}"
 
@@ -201,13 +191,7 @@ def test_a_reading_brings_its_own_noise_from_a_table():
     np.testing.assert_array_equal(ours.std[rows], theirs.std)
 
 
-@pytest.mark.parametrize(("old", "new", "expected"), [
-    ("{std: a}", "{std: a, variance: a}", "motor.yaml:10: source.sensors.winding.accuracy gives both std and variance; keep one"),  # noqa: E501
-    ("{std: a}", "{scale: 2}", "motor.yaml:10: source.sensors.winding.accuracy gives neither std nor variance; add it"),
-    ("{std: a}", "{std: [a, a]}", "motor.yaml:10: source.sensors.winding.accuracy names 2; give one, or one for each of the 1 values"),  # noqa: E501
-    ("estimator: kf", "estimator: {name: kf, options: {adapt: R}}", "motor.yaml:2: estimator kf: readings bring their own variance, but adapt learns one R of each sensor; set adapt to off or Q"),  # noqa: E501
-    ("  sensors:\n    winding: ", "  sensors: {winding: {columns: w}}\n  truth:\n    temperature: ", "motor.yaml:11: source.truth.temperature.accuracy is for sensors; leave it out"),  # noqa: E501
-])  # fmt: skip
+@cases(__file__, "accuracies.csv")
 def test_an_accuracy_that_cannot_be_used_is_one_line(old, new, expected):
     assert old in TABLE
     assert refusal(TABLE.replace(old, new)) == expected

@@ -4,6 +4,7 @@ import pytest
 
 from config.loader import TWINS
 from tests.app.twin.written import refusal, twin_of
+from tests.cases import cases
 
 pytestmark = pytest.mark.usefixtures("inside")
 
@@ -24,19 +25,7 @@ def test_durations_and_a_lone_entry():
     assert section.adopt == "if better"
 
 
-@pytest.mark.parametrize(
-    ("section", "said"),
-    [
-        ("  entries: [p.coper]\n  every: 60\n  window: 60\n", "refit.entries names p.coper: p.coper is no entry"),
-        ("  entries: [p.yoke_coolant]\n  every: 60\n  window: 60\n", "which `estimate` moves into the state"),
-        ("  entries: [prior.magnet.std]\n  every: 60\n  window: 60\n", "a window begins where the filter is"),
-        ("  entries: []\n  every: 60\n  window: 60\n", "refit.entries"),
-        ("  entries: [p]\n  every: 0\n  window: 60\n", "refit.every"),
-        ("  entries: [p]\n  every: 60\n", "refit.window"),
-        ("  entries: [p]\n  every: 60\n  window: 60\n  adopt: always\n", "refit.adopt"),
-        ("  entries: [p]\n  every: soon\n  window: 60\n", "refit.every"),
-    ],
-)
+@cases(__file__, "refits.csv")
 def test_what_is_refused_has_its_line(section, said):
     text = refusal(f"{JOINT}\nrefit:\n{section}")
     assert said in text and "motor.yaml:" in text

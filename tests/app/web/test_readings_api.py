@@ -16,6 +16,7 @@ from sources.messages import Messages, SentNumbers
 from sources.source import Accuracy, Channel, Condition, ignore
 from sources.tables.text import TextMatch
 from tests.app.served import ServedEngine
+from tests.cases import cases
 from tests.support import SECOND
 from tests.waiting import LIMIT_S, wait_for
 
@@ -298,22 +299,11 @@ def test_lines_of_ndjson_are_sent_and_the_wrong_ones_named(page, nisus, monkeypa
     assert said.count("\n") == 1 and "line 4: it must be an object with values" in said
 
 
-@pytest.mark.parametrize(
-    ("url", "lines", "text"),
-    [
-        (None, "", "is no address of a twin with its token; give the one that `nisus run` printed"),
-        ("http://127.0.0.1:9/?token=x", "", "no twin answers"),
-        ("{host}/?token=x", "", "the twin refuses: Nisus: open the page at the address"),
-        ("http://127.0.0.1:9/?token=a%0d%0ab", "", "is no address of a twin with its token"),
-        ("http://127.0.0.1:9/?token=%e2%82%ac", "", "is no address of a twin with its token"),
-        ("{url}", "t,level\n1,2\n", "line 1: none of its columns is a value of the twin, which reads winding"),
-        ("{url}", "times,winding\n1,2\n", "--time tme: line 1 has no such column; did you mean times?"),
-    ],
-)
+@cases(__file__, "refused_pushes.csv")
 def test_push_says_what_is_wrong_with_address_and_columns(page, nisus, monkeypatch, url, lines, text):
     monkeypatch.delenv("NISUS_URL", raising=False)
     monkeypatch.setattr("sys.stdin", io.StringIO(lines))
-    given = [] if url is None else [url.format(host=page.client.origin, url=page.server.url)]
+    given = [] if not url else [url.format(host=page.client.origin, url=page.server.url)]
     assert text in nisus.refuses("push", *given, *(["--time", "tme"] if "tme" in text else []))
 
 

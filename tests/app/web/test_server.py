@@ -18,6 +18,7 @@ from estimators.errors import ConfigError
 from tests import ROOT
 from tests.app.scripted import Scripted, twin
 from tests.app.served import SECRET, Client
+from tests.cases import cases
 from tests.waiting import wait_for
 
 
@@ -131,42 +132,18 @@ def test_a_token_of_a_file_opens_what_its_role_allows(tmp_path, role):
         assert ask(gate, path, method=method, **headers, origin="http://elsewhere")[0] == 403
 
 
-@pytest.mark.parametrize(
-    ("text", "mode", "reason"),
-    [
-        ("grafana view 0123456789abcdef\n", 0o640, "other users can read it; chmod 600"),
-        ("grafana view\n", 0o600, ":1: has 2 words; it must be NAME ROLE TOKEN"),
-        ("\ngrafana veiw 0123456789abcdef\n", 0o600, ":2: role veiw is not known; did you mean view?"),
-        ("grafana view 0123\n", 0o600, ":1: the token of grafana has 4 letters; give at least 16"),
-        ("a view 0123456789abcdef\na tune 0123456789abcdeg\n", 0o600, ":2: a or its token is there twice"),
-        ("a view 0123456789abcdef\nb tune 0123456789abcdef\n", 0o600, ":2: b or its token is there twice"),
-    ],
-)
+@cases(__file__, "wrong_tokens.csv")
 def test_a_wrong_file_of_tokens_is_one_line(nisus, tmp_path, text, mode, reason):
-    path = tokens_file(tmp_path, text, mode)
+    path = tokens_file(tmp_path, text, int(mode, 8))
     assert reason in nisus.refuses("run", "motor_winding", "--no-browser", "--tokens", path)
     assert "cannot be read" in nisus.refuses("run", "motor_winding", "--tokens", tmp_path / "none")
 
 
-@pytest.mark.parametrize(
-    ("host", "origin", "status"),
-    [
-        ("192.168.1.5:9900", None, 299),
-        ("192.168.1.5:9900", "http://192.168.1.5:9900", 299),
-        ("[fd00::1]:9900", None, 299),
-        ("twins.example.com", "https://twins.example.com", 299),
-        ("127.0.0.1:9900", None, 299),
-        ("elsewhere.example:9900", None, 403),
-        ("192.168.1.5.elsewhere.example:9900", None, 403),
-        ("192.168.1.5:9900", "http://elsewhere.example", 403),
-        ("twins.example.com", "http://twins.example.com", 403),
-        ("192.168.1.5:9900", "https://twins.example.com", 403),
-    ],
-)
+@cases(__file__, "addresses.csv")
 def test_a_service_on_other_addresses_has_its_own_names_only(host, origin, status):
     gate = Gate(behind, "t" * 40, 9900, addresses=True, public="https://twins.example.com")
     headers = {"host": host, "authorization": "Bearer " + "t" * 40} | ({"origin": origin} if origin else {})
-    assert ask(gate, "/api/state", **headers)[0] == status
+    assert ask(gate, "/api/state", **headers)[0] == int(status)
     if host != "127.0.0.1:9900":
         assert ask(Gate(behind, "t" * 40, 9900), "/api/state", **headers)[0] == 403
 

@@ -20,6 +20,7 @@ from app.web.http import ApiRoute
 from estimators import fuse
 from estimators.track import DEGRADED, DIVERGED, STALE, SUSPECT, WAITING
 from tests.app.scripted import pull_all, readings
+from tests.cases import cases
 from tests.support import SECOND
 from tests.waiting import LIMIT_S, wait_for
 
@@ -128,18 +129,10 @@ def test_a_time_of_the_calendar_is_written_as_such(page):
     assert changed(page, t=1700006390000001000).time == "2023-11-14T23:59:50.000001Z"
 
 
-@pytest.mark.parametrize(
-    "fields",
-    [
-        {"value": 1.0, "std": float("nan"), "valid": True, "reason": ""},
-        {"value": 1.0, "std": None, "valid": True, "reason": ""},
-        {"value": 1.0, "std": 1.0, "valid": False, "reason": "x"},
-        {"value": None, "std": None, "valid": False, "reason": ""},
-    ],
-)
+@cases(__file__, "invalid_states.csv")
 def test_no_message_can_hold_a_value_without_validity(fields):
     with pytest.raises(ValidationError):
-        PublishedState(name="x", unit="1", protection_level=None, **fields)
+        PublishedState(name="x", unit="1", protection_level=None, **json.loads(fields))
 
 
 def test_the_stream_sends_each_change(page):

@@ -10,6 +10,7 @@ from estimators.models import MODELS
 from sources.faults.kinds import Fault
 from sources.faults.layer import Faults, FaultySource
 from sources.simulator import SensorPlan, Simulator
+from tests.cases import cases
 from tests.sources.can.can_tools import same
 from tests.support import read_all
 
@@ -90,19 +91,7 @@ source:
 """
 
 
-@pytest.mark.parametrize(
-    ("fault", "text"),
-    [
-        ("{sensor: windin, kind: stuck}", "sensor is 'windin', no sensor of motor_winding; "),
-        ("{sensor: winding, row: x, kind: stuck}", "row is 'x', no row of winding; "),
-        ("{sensor: winding, kind: stuk}", "faults[0].kind is 'stuk'; did you mean stuck?"),
-        ("{sensor: winding, kind: bias}", "size is missing; a fault of kind bias needs it"),
-        ("{sensor: winding, kind: outliers, size: 3}", "rate is missing; a fault of kind outliers needs it"),
-        ("{sensor: winding, kind: stuck, size: 3}", "size is not used by a fault of kind stuck; leave it out"),
-        ("{sensor: winding, kind: stuck, start: 4, end: 3}", "end is 3 s; it must be above start"),
-        ("{sensor: winding, kind: dropout, rate: 1.5}", "rate is 1.5; it is a probability, above 0 and 1 at most"),
-    ],
-)
+@cases(__file__, "refused_faults.csv")
 def test_the_yaml_says_what_is_wrong_with_a_fault(tmp_path, fault, text):
     path = tmp_path / "pump.yaml"
     path.write_text(YAML.replace("{FAULT}", fault))

@@ -24,6 +24,7 @@ from estimators.errors import ConfigError
 from estimators.fit.uncertainty import ParameterWidths
 from estimators.registry import ESTIMATORS
 from tests.app.web.page.browsed import running, settled
+from tests.cases import cases
 
 
 def same(a, b):
@@ -301,28 +302,15 @@ def test_the_name_is_in_every_row_and_recording(winding, tmp_path):
     assert back.tuning.baseline[0, 0] == 0.25
 
 
-@pytest.mark.parametrize(
-    ("change", "said"),
-    [
-        (("rate: {variance", "ratee: {variance"), r"tried\.yaml:11: noise\.ratee is no noise .* did you mean rate\?"),
-        (("variance: 0.001", "varianc: 0.001"), r"tried\.yaml:11: noise\.rate\.varianc is not known; did you mean v"),
-        (("variance: 4,", "variance: -4,"), r"tried\.yaml:13: sensors\.winding\.variance.* is -4; it must be zero"),
-        (("winding: {variance", "yoke: {variance"), r"tried\.yaml:13: sensors\.yoke is no sensor"),
-        (("estimator: kf", "estimator: kff"), r"tried\.yaml:8: .*kff.*did you mean kf"),
-        (("gate: null", "gate: 2"), r"tried\.yaml:14: gate.* is 2; it must be below 1"),
-        (("model: motor_winding", "model: motor_drive"), r"tried\.yaml:4: version\.model is 'motor_drive'; the model"),
-        (("  saved:", "  save:"), r"tried\.yaml:5: version\.save is not known; did you mean saved"),
-        (("version:", "versio:"), r"tried\.yaml:2: versio is not known; did you mean version"),
-    ],
-)
-def test_what_is_wrong_is_said_with_its_line(winding, change, said):
+@cases(__file__, "wrong_versions.csv")
+def test_what_is_wrong_is_said_with_its_line(winding, old, new, said):
     twin = load_twin(winding)
     given = Settings("kf", twin.tuning, note="tried", scores={"nis": 1.0})
     text = version_text(twin, given)
-    assert change[0] in text
+    assert old in text
     folder = folders(winding)[0]
     folder.mkdir()
-    (folder / "tried.yaml").write_text(text.replace(change[0], change[1], 1), encoding="utf-8")
+    (folder / "tried.yaml").write_text(text.replace(old, new, 1), encoding="utf-8")
     with pytest.raises(ConfigError, match=said):
         load_twin(winding, overrides={"tuning": "tried"})
 
