@@ -121,7 +121,7 @@ def test_health_decides_whether_an_estimate_is_published(page, health, valid):
 
 def test_a_withheld_state_has_its_reason(page):
     name = page.engine.model.shown_states[0].name
-    first = changed(page, t=5 * SECOND, withheld={name: "too uncertain, ± 3 °C"}).states[0]
+    first = changed(page, t=5 * SECOND, grades={name: ("withheld", "too uncertain, ± 3 °C")}).states[0]
     assert (first.name, first.value, first.valid, first.reason) == (name, None, False, "too uncertain, ± 3 °C")
 
 

@@ -205,7 +205,7 @@ def test_assets_of_other_parameters_share_nothing():
     for a, tuning in enumerate(tunings):
         log = Log.of(model)
         log.add("gauge", t, y)
-        fold = folded("kf", model, log, tuning)
+        fold = folded("kf", model, log, tuning, policy=fleet.policy)
         assert_same(fleet, a, fold)
 
 
@@ -275,7 +275,7 @@ def test_a_new_asset_begins_from_the_spread_of_its_siblings():
         target.add("winding", *asset, [1.0, 2.0, 3.0], [38.0, 39.0, 38.5])
     fleet.add("winding", 40, 1.0, 38.0)
     fleet.advance()
-    fold = folded("kf", model, log, prior=(mean, cov))
+    fold = folded("kf", model, log, prior=(mean, cov), policy=fleet.policy)
     assert_same(fleet, 41, fold)
     alone = Fold("kf", model, Tuning.of(model), Log.of(model))
     assert fold.track.mean[0].tobytes() != alone.prior[0].tobytes() and fleet.table().events[40] == 1
