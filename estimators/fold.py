@@ -86,30 +86,32 @@ class Fold:
         check_soft(tuning, self.estimator, self.options)
         self.n, self._checked = 0, -1
         self._check_log()
-        self._machine = Machine(
+        self.machine = Machine(
             self.estimator, self.options, model, tuning, self.pairs, self.policy, prior=prior, expected=expected
         )
-        self.marginal, self.gate_limits = self._machine.marginal, self._machine.gate_limits
+        """Estimator, context and scratch of this fold."""
+        self.marginal, self.gate_limits = self.machine.marginal, self.machine.gate_limits
         self.decisions: list[Decision] = []
         """Decisions on sensors that stayed rejected, see gate/."""
-        self._now = self._machine.fresh()
+        self._now = self.machine.fresh()
         self._spare = np.empty_like(self._now.state)
-        self.idle, self._start = idle, self._machine.prior if base is None else (base.mean, base.cov)
+        self.idle, self._start = idle, self.machine.prior if base is None else (base.mean, base.cov)
         if base is not None:
             check_base(base, model)
         if idle:
             self._now.state[:] = 0.0
         elif base is not None:
-            self._machine.begin_at(base, self._now)
+            self.machine.begin_at(base, self._now)
         else:
-            self._machine.begin(*self._machine.prior, self._now.state)
+            self.machine.begin(*self.machine.prior, self._now.state)
             if log.start != BEFORE:
                 self._now.clock[0] = log.start
-        self._snapshots = Snapshots(self._now.state.nbytes)
+        self.snapshots = Snapshots(self._now.state.nbytes)
+        """Snapshots to which the fold can be rewound."""
         self.pictures = Pictures(model.grid, picture) if model.grid is not None else None
         self._asked = -1
         self._remember(self._now.copy())
-        self._rows = self._machine.rows(max(log.capacity, room))
+        self._rows = self.machine.rows(max(log.capacity, room))
 
     @property
     def events(self) -> Events:
@@ -129,17 +131,7 @@ class Fold:
     @property
     def compiled(self) -> CompiledModel:
         """The compiled functions of the model."""
-        return self._machine.compiled
-
-    @property
-    def machine(self) -> Machine:
-        """Estimator, context and scratch of this fold."""
-        return self._machine
-
-    @property
-    def snapshots(self) -> Snapshots:
-        """Snapshots to which the fold can be rewound."""
-        return self._snapshots
+        return self.machine.compiled
 
     @property
     def clock(self) -> int:
@@ -154,11 +146,11 @@ class Fold:
     @property
     def prior(self) -> Moments:
         """Mean (nx,) and covariance (nx, nx) at the start without a base, and after a reset."""
-        return self._machine.prior
+        return self.machine.prior
 
     def moments(self) -> Moments:
         """Return mean (nx,) and covariance (nx, nx) at `clock`; beyond `LARGE` states the variances (1, nx)."""
-        return self._start if self.idle else self._machine.moments(self._now.state)
+        return self._start if self.idle else self.machine.moments(self._now.state)
 
     def described(self, t: int | None = None, u: np.ndarray | None = None) -> np.ndarray:
         """Return the mean of the shown states at `clock`, or as the next event would be predicted at its time `t`, ns.
@@ -173,7 +165,7 @@ class Fold:
         try:
             if u is not None:
                 now.u[:] = u
-            self._machine.run(log, row, row + 1, now, self._spare, self._rows)
+            self.machine.run(log, row, row + 1, now, self._spare, self._rows)
             return self._rows.mean[row].copy()
         finally:
             log.kind[row], log.t[row] = event
@@ -205,12 +197,12 @@ class Fold:
     @property
     def failures(self) -> int:
         """Number of failures of a black box since this fold was made; their measurements have the verdict failed."""
-        return self._machine.failures
+        return int(getattr(self.machine.context, "failures", 0))
 
     @property
     def failure(self) -> ModelError | None:
         """The last error of a black box."""
-        return self._machine.failure
+        return getattr(self.machine.context, "failure", None)
 
     def peaks(self) -> list[Peak]:
         """Return the peaks of the estimate, the heaviest first; a Gaussian filter has one."""
@@ -237,7 +229,7 @@ class Fold:
         end = self.log.n if limit is None else min(self.log.n, self.n + limit)
         begun = self.n
         if self.log.capacity > len(self._rows):
-            grown = self._machine.rows(self.log.capacity)
+            grown = self.machine.rows(self.log.capacity)
             for new, old in zip(grown, self._rows, strict=True):
                 new[: self.n] = old[: self.n]
             self._rows = grown
@@ -246,7 +238,7 @@ class Fold:
             if self.pictures is not None and self.pictures.check(log, self.n):
                 self._take_picture()
             # Snapshots are dense at the end of the log, where late measurements fall, not at the end of this call.
-            boundaries = [at - log.first for at in self._snapshots.stops(log.first + self.n, log.first + log.n)]
+            boundaries = [at - log.first for at in self.snapshots.stops(log.first + self.n, log.first + log.n)]
             stop = min(end, boundaries[-1])
             if self.pictures is not None:
                 stop = self.pictures.next(log, self.n, stop)
@@ -269,7 +261,7 @@ class Fold:
                         changed = self._decide(asking)
             except BaseException:
                 # Interrupted between two events: return to the last consistent state.
-                self._machine.settle()
+                self.machine.settle()
                 self._restore(begun_at)
                 raise
             if stop in boundaries or changed:
@@ -293,9 +285,9 @@ class Fold:
             sensor: Sensor whose gate is off; the covariance is widened before its measurement.
             every: Whether the gates of all sensors are off.
         """
-        at = self._snapshots.last(self.log.first + start)
-        first = at - self.log.first, self._snapshots[at]
-        return self._machine.second_story(self.log, *first, start, stop, sensor, self._rows.innovation[start], every)
+        at = self.snapshots.last(self.log.first + start)
+        first = at - self.log.first, self.snapshots[at]
+        return self.machine.second_story(self.log, *first, start, stop, sensor, self._rows.innovation[start], every)
 
     def go_on_with(self, story: Story) -> None:
         """Adopt the state at the end of a story."""
@@ -307,7 +299,7 @@ class Fold:
 
         The `blanks` become snapshots at their events, all before `stop`; after a decision, the later ones stay blank.
         """
-        asking = self._machine.run(self.log, start, stop, self._now, self._spare, self._rows, blanks)
+        asking = self.machine.run(self.log, start, stop, self._now, self._spare, self._rows, blanks)
         self._asked = stop - 1 if asking < 0 else -1
         return asking
 
@@ -323,8 +315,8 @@ class Fold:
         The filter restarts from these moments, and so loses the shape of particles, members and modes.
         """
         self._run_events(i, i + 1)
-        mean, cov = self._machine.moments(self._spare)
-        if self._machine.maintain(mean, cov, int(self.log.channel[i]), int(self.log.t[i]), self._now):
+        mean, cov = self.machine.moments(self._spare)
+        if self.machine.maintain(mean, cov, int(self.log.channel[i]), int(self.log.t[i]), self._now):
             self._run_events(i, i + 1)
 
     def finish(self) -> None:
@@ -343,11 +335,11 @@ class Fold:
             evidence = self._now.evidence.copy()
             self._run_events(last, self.n)
             self._now.evidence[:] = evidence
-        mean, cov = self._machine.moments(self._spare if query else self._now.state)
+        mean, cov = self.machine.moments(self._spare if query else self._now.state)
         self.pictures.take(self.log, self.n, mean, variances_of(cov))
 
     def _remember(self, snapshot: Snapshot, pinned: bool = False) -> None:
-        self._snapshots.keep(self.log.first + self.n, self.log.first, snapshot, pinned)
+        self.snapshots.keep(self.log.first + self.n, self.log.first, snapshot, pinned)
 
     def rewind(self, index: int) -> None:
         """Go back so that the event at `index` and all after it are folded again."""
@@ -355,9 +347,9 @@ class Fold:
             self._restore(index)
 
     def _restore(self, index: int) -> None:
-        at = self._snapshots.last(self.log.first + index)
-        self._snapshots.forget_after(at)
-        self._now.put(self._snapshots[at])
+        at = self.snapshots.last(self.log.first + index)
+        self.snapshots.forget_after(at)
+        self._now.put(self.snapshots[at])
         self.decisions = [decision for decision in self.decisions if decision.row < at]
         self.n = at - self.log.first
         self._asked = -1
@@ -366,8 +358,8 @@ class Fold:
 
     def base_at(self, index: int) -> tuple[int, Base]:
         """Return the last snapshot at or before event `index`: its index, and the base of a fold that starts there."""
-        at = self._snapshots.last(self.log.first + index)
-        return at - self.log.first, self._base(at, self._snapshots[at])
+        at = self.snapshots.last(self.log.first + index)
+        return at - self.log.first, self._base(at, self.snapshots[at])
 
     def base_here(self) -> Base:
         """Return the base of a fold that continues with the next event."""
@@ -375,7 +367,7 @@ class Fold:
 
     def _base(self, at: int, snapshot: Snapshot) -> Base:
         left = snapshot.copy()
-        mean, cov = self._machine.moments(left.state)
+        mean, cov = self.machine.moments(left.state)
         return Base(
             mean,
             cov,
@@ -414,7 +406,7 @@ class Fold:
 
         Call it before `Log.drop_front`.
         """
-        if self.log.first + count not in self._snapshots:
+        if self.log.first + count not in self.snapshots:
             raise EstimatorError(f"cannot drop {count} events: no snapshot there; drop up to one that base_at names")
         for column in self._rows:
             column[: self.n - count] = column[count : self.n].copy()
@@ -422,7 +414,7 @@ class Fold:
         self._asked = -1
         if self.pictures is not None:
             self.pictures.drop_front(self.log.first + count)
-        self._snapshots.forget_before(self.log.first + count)
+        self.snapshots.forget_before(self.log.first + count)
         self.decisions = [decision for decision in self.decisions if decision.row >= self.log.first + count]
 
 

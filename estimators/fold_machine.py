@@ -15,7 +15,6 @@ from .compiled.model import compile_model
 from .diagnostics.detector_state import detector_context, fresh, no_baseline
 from .diagnostics.health import Bounds, HealthPolicy, chi_square_bounds
 from .diagnostics.memory import fresh_memory, memory_context
-from .errors import ModelError
 from .estimator import Code, Estimator, Options
 from .events.maintenance import without
 from .fold_kernel import compiled, compiled_judge
@@ -132,16 +131,6 @@ class Machine:
     def prior(self) -> Moments:
         """Mean (nx,) and covariance (nx, nx) at the log's start; of a large state the variances (1, nx)."""
         return self.held["prior_mean"], self.held["prior_cov"]
-
-    @property
-    def failures(self) -> int:
-        """Number of failures of a black box."""
-        return int(getattr(self.context, "failures", 0))
-
-    @property
-    def failure(self) -> ModelError | None:
-        """The last error of a black box."""
-        return getattr(self.context, "failure", None)
 
     def fresh(self) -> Snapshot:
         """Return the snapshot before the first event; `begin` has yet to fill the filter's state."""

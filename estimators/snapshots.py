@@ -98,18 +98,14 @@ class Snapshots:
     def __init__(self, nbytes: int) -> None:
         """Plan for states of `nbytes` bytes. The start, an old and a recent snapshot are kept, however large."""
         self._most = max(1, MAX_SNAPSHOT_BYTES // 2 // nbytes)
-        self._every = NEAR_SPACING
-        while RECENT_EVENTS // self._every > self._most:
-            self._every *= 2
-        self._sparse = max(PERMANENT_SPACING, self._every)
-        self._wider = max(min(RECENT_SPACING, self._sparse), self._every)
+        self.every = NEAR_SPACING
+        """Events between two of the latest: how far a slightly late measurement takes the fold back at most."""
+        while RECENT_EVENTS // self.every > self._most:
+            self.every *= 2
+        self._sparse = max(PERMANENT_SPACING, self.every)
+        self._wider = max(min(RECENT_SPACING, self._sparse), self.every)
         self._kept: dict[int, Snapshot] = {}
         self._pinned: list[int] = []
-
-    @property
-    def every(self) -> int:
-        """Events between two of the latest: how far a slightly late measurement takes the fold back at most."""
-        return self._every
 
     @property
     def places(self) -> list[int]:
@@ -128,7 +124,7 @@ class Snapshots:
         """Return the absolute index after `at` at which a fold that goes on to `end` takes the next snapshot."""
         # Stop only for snapshots that are still kept once the fold has reached the end.
         recent, near = max(at + 1, end - RECENT_EVENTS), max(at + 1, end - NEAR_EVENTS)
-        sparse, wider, every = self._sparse, self._wider, self._every
+        sparse, wider, every = self._sparse, self._wider, self.every
         return min(-(-(at + 1) // sparse) * sparse, -(-recent // wider) * wider, -(-near // every) * every)
 
     def stops(self, at: int, end: int) -> list[int]:

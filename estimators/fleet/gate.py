@@ -31,16 +31,12 @@ class AssetFold:
         self._machine, self._now, self._begun = machine, now, begun
         # Rows do not depend on the record of rejections, which would ask for decisions and end the loop.
         begun = begun.copy()._replace(doubt=fresh(len(self.model.sensors)))
-        self._track, _ = machine.run_apart(log, 0, log.n, begun)
-
-    @property
-    def track(self) -> Track:
+        self.track: Track = machine.run_apart(log, 0, log.n, begun)[0]
         """Rows of the log."""
-        return self._track
 
     def second_story(self, start: int, stop: int, sensor: int, *, every: bool = False) -> Story:
         """See `Fold.second_story`."""
-        innovation = self._track.innovation[start]
+        innovation = self.track.innovation[start]
         return self._machine.second_story(self.log, 0, self._begun, start, stop, sensor, innovation, every)
 
     def go_on_with(self, story: Story) -> None:

@@ -12,8 +12,6 @@ from ..diagnostics.detectors import DETECTORS, IMPOSSIBLE, OUTSIDE, SENSOR_MASK,
 from ..model.state_space import StateSpaceModel
 from ..track import DEGRADED, DIVERGED, HEALTH_NAMES, STALE
 
-"""Bits of the flags of sensors that dropped out."""
-
 
 class FleetTable(NamedTuple):
     """One row per asset, in the order of `Fleet.assets`.

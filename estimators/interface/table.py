@@ -79,26 +79,25 @@ def table_of(
     for name in ("nis", "nis_mean", "nis_low", "nis_high", "log_likelihood"):
         columns[name] = getattr(track, name)
     columns["verdict"] = np.array(VERDICT_NAMES)[track.verdict]
-    columns["screened"] = _reasons(track.screened)
+    columns["screened"] = _words(np.bitwise_or.reduce(track.screened, axis=1), _REASONS)
     columns["health"] = np.array(HEALTH_NAMES)[track.health]
     columns["model_version"] = model_versions(events, model_version)
     columns["tuning_version"] = np.full(len(events), tuning_version, np.int64)
     columns["tuning"] = pa.array([tuning or None] * len(events), pa.string())
-    columns["alarms"] = pa.array(
-        _words(np.bitwise_or.reduce(track.alarms, axis=1, dtype=np.int64), _CAUSES), pa.string()
-    )
+    columns["alarms"] = _words(np.bitwise_or.reduce(track.alarms, axis=1, dtype=np.int64), _CAUSES)
     if any(state.withhold < np.inf for state in model.shown_states):
         names = {1 << k: name for k, name in enumerate(shown)}
-        columns["withheld"] = pa.array(_words(hidden @ np.array(list(names), np.int64), names), pa.string())
+        columns["withheld"] = _words(hidden @ np.array(list(names), np.int64), names)
     bits = {1 << k: f"{name} silent" for k, name in enumerate(model.sensor_names[:SENSOR_FLAGS])} | _FLAGS
     bits |= {memory_flag(k): f"{name} corrected" for k, name in enumerate(shown)}
-    columns["flags"] = pa.array(_words(track.flags, bits), pa.string())
+    columns["flags"] = _words(track.flags, bits)
     plain = {k: np.ascontiguousarray(c) if isinstance(c, np.ndarray) else c for k, c in columns.items()}
     metadata = {"episodes": json.dumps([episode_json(episode) for episode in episodes])}
     return pa.table(plain).replace_schema_metadata(metadata)
 
 
 _CAUSES = {1 << k: cause for k, cause in enumerate(ALARM_NAMES)}
+_REASONS = {1 << k: reason for k, reason in enumerate(REASONS)}
 _FLAGS = {
     IMPOVERISHED: "impoverished",
     OUTSIDE: "outside the fitted range",
@@ -107,18 +106,10 @@ _FLAGS = {
 }
 
 
-def _words(masks: np.ndarray, bits: dict[int, str]) -> np.ndarray:
-    """Return the words of each mask's bits, joined by commas; None where there are none."""
-    kinds, which = np.unique(masks, return_inverse=True)
-    said = [", ".join(word for bit, word in bits.items() if int(mask) & bit) or None for mask in kinds]
-    return np.array(said, object)[which.reshape(-1)]
-
-
-def _reasons(screened: np.ndarray) -> Any:
-    """Return the reasons why rows were rejected before the filter, as `range, rate`; null where they were not."""
+def _words(masks: np.ndarray, bits: dict[int, str]) -> Any:
+    """Return the words of each mask's bits, joined by commas; null where there are none."""
     import pyarrow as pa
 
-    every = range(1 << len(REASONS))
-    words = [", ".join(name for k, name in enumerate(REASONS) if bits & (1 << k)) or None for bits in every]
-    bits = np.bitwise_or.reduce(screened, axis=1)
-    return pa.array(np.array(words, object)[bits], pa.string())
+    kinds, which = np.unique(masks, return_inverse=True)
+    said = [", ".join(word for bit, word in bits.items() if int(mask) & bit) or None for mask in kinds]
+    return pa.array(np.array(said, object)[which.reshape(-1)], pa.string())

@@ -184,7 +184,7 @@ def alone(estimator: str, model: StateSpaceModel) -> Callable[[], None]:
     log = noisy_log(model, STEPS, step=0.1)
     fold = Fold(estimator, model, Tuning.of(model), log)
     fold.advance()
-    machine, now = fold._machine, fold._now
+    machine, now = fold.machine, fold._now
     places = (now.u, now.state, machine.work, machine.score, log.value, *np.empty((2, model.width)))
 
     def steps() -> None:

@@ -205,7 +205,7 @@ def defences() -> Iterator[BenchmarkRow]:
         rows.append((name, estimator, twin.model, tuning, log))
     for name, estimator, model, tuning, log in rows:
         defended, bare = (Fold(estimator, model, tuning, log) for _ in range(2))
-        defended._machine._run, bare._machine._run = kernel(bare=False), kernel(bare=True)
+        defended.machine._run, bare.machine._run = kernel(bare=False), kernel(bare=True)
         times = np.array([[seconds(partial(again, fold)) for fold in (defended, bare)] for _ in range(9)])
         least = times[1:].min(axis=0) / log.n * 1e6
         figures = {"all [µs]": least[0], "bare [µs]": least[1], "ratio": least[0] / least[1]}

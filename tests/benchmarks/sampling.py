@@ -221,7 +221,7 @@ def analysis(model: StateSpaceModel, name: str, options: dict[str, float], repet
     times = [both(lambda: fold.advance(1)) for _ in range(repetitions)]
     assert np.all(fold.track.verdict[: fold.n] == USED), "an analysis was not made"
     ensemble = fold._now.state.nbytes
-    memory = (ensemble + fold._machine.work.nbytes + _peak() - peak) / ensemble
+    memory = (ensemble + fold.machine.work.nbytes + _peak() - peak) / ensemble
     return median(t for t, _ in times), median(t for _, t in times), memory
 
 

@@ -82,7 +82,7 @@ def check(name, model, options):
     fold = Fold(name, model, tuning, log)
     work = entry.work_size(fold.options, model.nx, model.width)
     size = fold._now.state.size
-    fold._machine.work, *wholes = guarded(fold._machine.work, work)
+    fold.machine.work, *wholes = guarded(fold.machine.work, work)
     state, whole = guarded(fold._now.state, size)
     fold._spare, spare = guarded(fold._spare, size)
     fold._now = fold._now._replace(state=state)

@@ -118,7 +118,7 @@ def model(correlation):
 def context():
     declared = model(C)
     fold = Fold("kf", declared, Tuning.of(declared), Log(declared.width))
-    yield fold._machine.context
+    yield fold.machine.context
     del fold
 
 

@@ -115,7 +115,7 @@ def test_what_is_forgotten_in_front_takes_its_pictures_along(events):
     fold = folded(events)
     count, _ = fold.base_at(len(events) // 2)
     if not count:
-        fold._snapshots._kept[60] = fold._snapshots[0]
+        fold.snapshots._kept[60] = fold.snapshots[0]
         count = 60
     expected = [picture for picture in fold.pictures.taken if picture.before >= count]
     fold.drop_front(count)

@@ -93,7 +93,7 @@ def test_the_tuned_variances_are_back_afterwards(name):
         pass
     assert_same(growing.track, whole)
     np.testing.assert_array_equal(tuning.r, before)
-    np.testing.assert_array_equal(growing._machine.held["r"], before)
+    np.testing.assert_array_equal(growing.machine.held["r"], before)
 
 
 def test_a_row_without_its_own_keeps_the_tuned_one():

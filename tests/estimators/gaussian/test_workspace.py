@@ -92,7 +92,7 @@ def test_nothing_is_written_beyond_the_scratch(name, n, m):
             guarded = np.frombuffer(np.full(room + 128, 0x7FF8_DEAD_BEEF_CAFE, np.uint64).tobytes()).copy()
             plain = Fold(name, model, Tuning.of(model).with_options(options), log)
             fold = Fold(name, model, Tuning.of(model).with_options(options), log)
-            fold._machine.work = guarded[64 : 64 + room]
+            fold.machine.work = guarded[64 : 64 + room]
             fold.advance()
             plain.advance()
             guards = np.concatenate((guarded[:64], guarded[64 + room :])).view(np.uint64)

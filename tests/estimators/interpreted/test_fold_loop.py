@@ -45,7 +45,7 @@ def test_a_view_has_the_numbers_of_the_context():
     rng = np.random.default_rng(8)
     matrices = random_linear(rng, 3, 2)
     model = matrices.model
-    view = Fold("filterpy-kf", model, Tuning.of(model), Log(model.width))._machine.context
+    view = Fold("filterpy-kf", model, Tuning.of(model), Log(model.width)).machine.context
     X, u, dt = rng.normal(0, 1, (5, 3)), rng.normal(0, 1, 2), 0.3
     F = np.eye(3) + dt * matrices.A
     np.testing.assert_allclose(view.F(X[0], u, dt), F, rtol=1e-13, atol=1e-13)

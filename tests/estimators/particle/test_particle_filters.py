@@ -320,8 +320,8 @@ def test_snapshots_of_large_states_keep_to_their_memory(monkeypatch):
     plain = folded("pf", model, log, tuning)
     monkeypatch.setattr("estimators.snapshots.MAX_SNAPSHOT_BYTES", 10 * plain._now.state.nbytes)
     small = folded("pf", model, log, tuning)
-    assert len(plain._snapshots._kept) > 20
-    assert sum(kept.state.nbytes for kept in small._snapshots._kept.values()) <= 12 * plain._now.state.nbytes
+    assert len(plain.snapshots._kept) > 20
+    assert sum(kept.state.nbytes for kept in small.snapshots._kept.values()) <= 12 * plain._now.state.nbytes
     small.rewind(2000)
     assert small.n <= 2000
     small.advance()
