@@ -38,20 +38,15 @@ def f(x, u, p, dt, out):
     out[NORTH] = x[NORTH] + way * np.sin(middle)
     out[HEADING] = x[HEADING] + turned
     out[SPEED] = x[SPEED] + gained
-    out[ACCEL_BIAS] = x[ACCEL_BIAS]
-    out[YAW_RATE_BIAS] = x[YAW_RATE_BIAS]
-    out[WHEEL_SCALE] = x[WHEEL_SCALE]
+    for i in range(ACCEL_BIAS, x.size):
+        out[i] = x[i]
 
 
 def Q(x, u, p, q, dt, out):
     """Fill Q: the same noise for east and north; one entry for each of the other states."""
     out[EAST, EAST] = q[0] * dt
-    out[NORTH, NORTH] = q[0] * dt
-    out[HEADING, HEADING] = q[1] * dt
-    out[SPEED, SPEED] = q[2] * dt
-    out[ACCEL_BIAS, ACCEL_BIAS] = q[3] * dt
-    out[YAW_RATE_BIAS, YAW_RATE_BIAS] = q[4] * dt
-    out[WHEEL_SCALE, WHEEL_SCALE] = q[5] * dt
+    for k in range(q.size):
+        out[NORTH + k, NORTH + k] = q[k] * dt
 
 
 def gnss_position(x, u, p, out):

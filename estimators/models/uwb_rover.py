@@ -51,10 +51,8 @@ def f(x, u, p, dt, out):
 def Q(x, u, p, q, dt, out):
     """Fill Q: the same noise for east and north, and for all biases."""
     out[EAST, EAST] = q[0] * dt
-    out[NORTH, NORTH] = q[0] * dt
-    out[HEADING, HEADING] = q[1] * dt
-    out[YAW_RATE_BIAS, YAW_RATE_BIAS] = q[2] * dt
-    out[RANGE_SCALE, RANGE_SCALE] = q[3] * dt
+    for k in range(4):
+        out[NORTH + k, NORTH + k] = q[k] * dt
     wandered = 0.5 * q[4] * p[BIAS_TIME] * (1.0 - np.exp(-2.0 * dt / p[BIAS_TIME]))
     for i in range(BIAS, x.size):
         out[i, i] = wandered
