@@ -222,9 +222,7 @@ def add_process_noise(context, x, u, dt, P, scratch):
 def add_given_noise(context, x, u, dt, P, scratch):
     """Add the model's own Q(x, u, p, q, dt) to P."""
     n = context.nx
-    for i in range(n):
-        for j in range(n):
-            scratch[i, j] = 0.0
+    scratch[:] = 0.0
     call_Q(context.Q, x, u, parameters(context), process_variances(context), dt, scratch)
     for i in range(n):
         for j in range(n):

@@ -11,8 +11,8 @@ from typing import Any
 
 import numpy as np
 
-from ..numerics.jit import complexes, floats, ints, linkable, part
-from ..numerics.linalg import wrap
+from ..numerics.jit import complexes, floats, ints, linkable, matrix, part
+from ..numerics.linalg import copy, wrap
 from ..numerics.workspace import layout
 from .context import (
     call_F,
@@ -37,7 +37,7 @@ def scratch_size(nx: int, ny: int) -> int:
 
 
 _COMPLEX_STEP = 1e-20
-_CENTRAL_STEP = 6e-6  # about the cube root of the rounding error, where truncation and rounding balance
+CENTRAL_STEP = 6e-6  # about the cube root of the rounding error, where truncation and rounding balance
 
 
 @linkable
@@ -93,7 +93,7 @@ def _central(context, sensor, x, u, dt, J, scratch):
     for i in range(n):
         z[i] = x[i]
     for j in range(n):
-        step = _CENTRAL_STEP * max(1.0, abs(x[j]))
+        step = CENTRAL_STEP * max(1.0, abs(x[j]))
         z[j] = x[j] + step
         above = z[j]
         _image(context, sensor, z, u, dt, high)
@@ -136,9 +136,7 @@ def sensor_jacobian(context, sensor, x, u, H, scratch):
         call_H(ints(context.H, context.n_sensors)[sensor], x, u, parameters(context), H)
     elif mode == CONSTANT:
         constant = floats(ints(context.H, context.n_sensors)[sensor], H.size)
-        for i in range(H.shape[0]):
-            for j in range(H.shape[1]):
-                H[i, j] = constant[i * H.shape[1] + j]
+        copy(matrix(constant, 0, H.shape[0], H.shape[1]), H)
     elif mode == COMPLEX_STEP:
         target = ints(context.h_complex, context.n_sensors)[sensor]
         complex_step(target, True, x, u, parameters(context), 0.0, H, scratch)

@@ -46,23 +46,17 @@ def semidefinite_root(A, L):
         # Written so that NaN fails too.
         if not pivot >= -1e-8 * abs(A[j, j]):
             return _not_semidefinite(L)
-        if pivot <= _SMALL * n * A[j, j]:
-            # No variance left in j, so no covariance with it either.
-            for i in range(j + 1, n):
-                s = A[i, j]
-                for k in range(j):
-                    s -= L[i, k] * L[j, k]
-                # The roots apart: the product of two tiny variances would underflow.
-                if not abs(s) <= 1e-6 * np.sqrt(A[i, i]) * np.sqrt(A[j, j]):
-                    return _not_semidefinite(L)
-            continue
-        root = np.sqrt(pivot)
+        root = np.sqrt(pivot) if pivot > _SMALL * n * A[j, j] else 0.0
         L[j, j] = root
         for i in range(j + 1, n):
             s = A[i, j]
             for k in range(j):
                 s -= L[i, k] * L[j, k]
-            L[i, j] = s / root
+            if root > 0.0:
+                L[i, j] = s / root
+            # No variance left in j, so no covariance either. Roots apart: a product of tiny variances would underflow.
+            elif not abs(s) <= 1e-6 * np.sqrt(A[i, i]) * np.sqrt(A[j, j]):
+                return _not_semidefinite(L)
     return True
 
 

@@ -37,7 +37,7 @@ from ..estimator import MEMBERS as HELD
 from ..estimator import TANGENT, Estimator, Option, Options, SmoothingRule
 from ..model.state_space import LARGE, StateSpaceModel
 from ..numerics.jit import ints, jit
-from ..numerics.linalg import wrap
+from ..numerics.linalg import copy_vector, wrap
 from ..numerics.random import fill_normals, key_of, normal, unit, word
 from ..numerics.simd import add_scaled
 from ..numerics.workspace import declare_layout, share, size_of, start_of, view
@@ -269,8 +269,7 @@ def forecast(context, u, dt, key, X, crew, crews, scratch):
                 if std > 0.0:
                     for j in range(first[k], first[k] + count[k]):
                         forward[j] += std * normal(key, np.uint64(base + j))
-        for j in range(n):
-            x[j] = forward[j]
+        copy_vector(forward, x)
 
 
 @jit(parallel=True)

@@ -23,7 +23,7 @@ from ..gate.isolation import Decision
 from ..log import _RANK
 from ..model.state_space import LARGE, StateSpaceModel
 from ..numerics.jit import threaded
-from ..numerics.workspace import WORD
+from ..numerics.workspace import WORD, view
 from ..registry import find_estimator
 from ..snapshots import Base, Snapshot
 from ..track import Track
@@ -162,7 +162,6 @@ class Fleet:
         self._rules = np.concatenate([self._rules, np.tile(self._rules[SHARED], (count, 1))])
 
     def _machine_of(self, asset: int) -> Machine:
-        """Return the machine of an asset."""
         k = int(self._tuning_of[asset])
         if k in self._machines:
             return self._machines[k]
@@ -476,9 +475,8 @@ class Fleet:
 
     def _snapshot(self, state: np.ndarray) -> Snapshot:
         """Return the numbers of a state as a snapshot, as views."""
-        parts = [state[part.at // WORD : part.at // WORD + int(np.prod(part.shape))] for part in self._state[:6]]
-        clock, u, own, evidence, edge, doubt = parts
-        return Snapshot(clock.view(np.int64), u, own, evidence, edge, doubt.reshape(self._state.doubt.shape))
+        clock, *rest = (view(part, state) for part in self._state[:6])
+        return Snapshot(clock.view(np.int64), *rest)
 
     def decisions(self, asset: Any) -> list[Decision]:
         """Return the latest decisions on rejected sensors of an asset; see `Fold.decisions`.

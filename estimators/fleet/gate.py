@@ -10,15 +10,14 @@ import numpy as np
 from ..fold_machine import Machine
 from ..gate.isolation import MAX_COMPARED_EVENTS, MAX_DECISIONS, Decision, decide
 from ..gate.rejection_runs import RUN, SINCE, fresh
-from ..log import _ORDER, Events, Log
+from ..log import Events, Log
 from ..model.state_space import StateSpaceModel
 from ..numerics.workspace import WORD, size_of, view
 from ..snapshots import Snapshot, Story
 from ..track import Track
+from .kernel import KINDS
 from .memory import FIRST, LAST, NEXT, PINNED, REWOUND, N, Record, record_at
 from .record import FREE, MAX_FREE, record_sizes
-
-_KINDS = np.array(_ORDER, np.int8)
 
 
 class AssetFold:
@@ -104,7 +103,6 @@ class FleetGates:
         return int(words.ctypes.data)
 
     def _record(self, asset: int) -> Any:
-        """Return the record of an asset as views."""
         words = self._records[int(self.places[asset])]
         parts = record_at(0, *self._sizes)
         found = {name: view(part, words) for name, part in zip(Record._fields, parts, strict=True) if name != "end"}
@@ -160,7 +158,7 @@ class FleetGates:
         value[:, :used] = record.value[at, :used]
         log = Log(model.width, max(1, t.size))
         log.model, log.layout, log.first, log.floor = model, model.layout, begin, int(t[0])
-        log.extend(Events(t, t, _KINDS[place >> 32], (place & 0xFFFFFFFF).astype(np.int32), value))
+        log.extend(Events(t, t, KINDS[place >> 32], (place & 0xFFFFFFFF).astype(np.int32), value))
         return log
 
     def state(self, first: int, last: int) -> list[bytes]:
@@ -177,14 +175,11 @@ class FleetGates:
         if rest:
             return False
         for asset in (first + np.flatnonzero(self.places[first : first + count])).tolist():
-            self._give_back(asset)
+            del self._records[int(self.places[asset])]
+            self.places[asset] = 0
         for line in np.frombuffer(state).reshape(lines, 1 + self._words):
             if not 0 <= int(line[:1].view(np.int64)[0]) < count:
                 return False
             words = line[1:].copy()
             self.places[first + int(line[:1].view(np.int64)[0])] = self._added(words)
         return True
-
-    def _give_back(self, asset: int) -> None:
-        del self._records[int(self.places[asset])]
-        self.places[asset] = 0

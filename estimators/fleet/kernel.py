@@ -22,6 +22,7 @@ from ..fold_kernel import fold_event
 from ..gate.rejection_runs import Rule
 from ..log import _ORDER
 from ..numerics.jit import borrowed, counts, embedded, flag_rows, flags, floats, i64, ints, jit, masks, matrix, part
+from ..numerics.linalg import copy_vector
 from ..track import WHITENED, Track, track_type
 from .memory import (
     AGE,
@@ -48,7 +49,7 @@ from .memory import (
     state_at,
 )
 from .order import precedes
-from .record import append, before_snapshot, copy, cut, free_records, slot_of, snapshots_of, take
+from .record import append, before_snapshot, cut, free_records, slot_of, snapshots_of, take
 from .window import has_no_baseline, return_to, slide
 
 _PLAN = """
@@ -67,7 +68,7 @@ CREW = (*Track._fields, "context", "r", "spare", "work", "score", "events_t", "k
 (_CONTEXT, _R, _SPARE, _WORK, _SCORE, _T, _KIND, _CHANNEL, _VALUE, _PASSED, _VARIANCES, _TERMS, _TAIL_T, _TAIL_PLACE,
  _TAIL_VALUE) = range(len(Track._fields), len(CREW))  # fmt: skip
 _CONTEXT_WORDS, _AT_R = len(CONTEXT_FIELDS), CONTEXT_FIELDS.index("r")
-_KINDS = np.array(_ORDER, np.int8)
+KINDS = np.array(_ORDER, np.int8)
 
 ASKED_FLAG, REWOUND_FLAG = 1, 2
 """Bits of `asked`: the asset's last event asks for a decision on its sensor; an asset with a record was rewound."""
@@ -80,8 +81,6 @@ _plan_type = from_dtype(PLAN)
 
 @intrinsic
 def _plan_at(typing_context, place):
-    """Return the plan at an address."""
-
     def codegen(lowering, builder, signature, given):
         return builder.inttoptr(given[0], lowering.get_value_type(_plan_type))
 
@@ -175,10 +174,10 @@ def _rewind(block, e, stop, order, t, place, value, recent, window, tail_t, tail
     if i == n:
         return e, 0
     at = newer if i >= newer else older
-    copy(block.snapshots[slot_of(block.head, at, recent)], block.now)
+    copy_vector(block.snapshots[slot_of(block.head, at, recent)], block.now)
     for k in range(at, n):
         tail_t[k - at], tail_place[k - at] = block.t[k % ring], block.place[k % ring]
-        copy(block.value[k % ring], tail_value[k - at])
+        copy_vector(block.value[k % ring], tail_value[k - at])
     return_to(at, block, window)
     block.head[N] = at
     return e, n - at
@@ -190,7 +189,7 @@ def _resume(record, tail_t, tail_place, tail_value):
     tail = record.head[TAIL]
     for k in range(tail):
         tail_t[k], tail_place[k] = record.tail_t[k], record.tail_place[k]
-        copy(record.tail_value[k], tail_value[k])
+        copy_vector(record.tail_value[k], tail_value[k])
     record.head[TAIL] = 0
     return tail
 
@@ -203,7 +202,7 @@ def _stop(record, n, oldest, a, tail, tail_t, tail_place, tail_value):
     record.head[TAIL] = tail - a
     for k in range(a, tail):
         record.tail_t[k - a], record.tail_place[k - a] = tail_t[k], tail_place[k]
-        copy(tail_value[k], record.tail_value[k - a])
+        copy_vector(tail_value[k], record.tail_value[k - a])
 
 
 @jit
@@ -266,8 +265,8 @@ def _fold_share(place, crew):
             # A copy: a soft gate writes R while a measurement is folded. Scratch may keep F of the other parameters.
             loaded = tuning
             work[:] = np.nan
-            copy(ints(plan.contexts + 8 * tuning * _CONTEXT_WORDS, _CONTEXT_WORDS), words)
-            copy(floats(words[_AT_R], plan.rows), floats(own[_R], plan.rows))
+            copy_vector(ints(plan.contexts + 8 * tuning * _CONTEXT_WORDS, _CONTEXT_WORDS), words)
+            copy_vector(floats(words[_AT_R], plan.rows), floats(own[_R], plan.rows))
             words[_AT_R] = own[_R]
             normal = floats(context.normal, NORMALS * plan.sensors)
             rules = ints(plan.rules + 16 * tuning, 2)
@@ -312,25 +311,25 @@ def _fold_share(place, crew):
                         record = record_at(record_place, plan.size, slots, ring, rows, columns)
                     oldest = newer
                 if recent > 0:
-                    copy(block.now, block.snapshots[slot_of(head, n, recent)])
+                    copy_vector(block.now, block.snapshots[slot_of(head, n, recent)])
             at = n % ring
             i = order[min(e, stop - 1)]
             if a < tail and (
                 e == stop or not precedes(t[i], event_place[i], value[i], tail_t[a], tail_place[a], tail_value[a])
             ):
                 block.t[at], block.place[at] = tail_t[a], tail_place[a]
-                copy(tail_value[a], block.value[at])
+                copy_vector(tail_value[a], block.value[at])
                 a += 1
             else:
                 block.t[at], block.place[at] = t[i], event_place[i]
-                copy(value[i], block.value[at])
+                copy_vector(value[i], block.value[at])
                 e += 1
             if record_place != 0:
                 append(record, n, block.t[at], block.place[at], block.value[at])
             own_t[1] = block.t[at]
-            kind[1] = _KINDS[block.place[at] >> 32]
+            kind[1] = KINDS[block.place[at] >> 32]
             channel[1] = block.place[at] & 0xFFFFFFFF
-            copy(block.value[at], own_value[1])
+            copy_vector(block.value[at], own_value[1])
             asks = fold_event(
                 code, context, rule, 1, n, 1, own_t, kind, channel, own_value, columns,
                 now.clock, now.u, now.filter, now.doubt, now.edge, spare, work, score, track, variances, passed, 0,
@@ -358,8 +357,8 @@ def _fold_share(place, crew):
                 asked[v] |= ASKED_FLAG
                 break
         if moved:
-            copy(track.mean[1], block.mean)
-            copy(track.std[1], block.std)
+            copy_vector(track.mean[1], block.mean)
+            copy_vector(track.std[1], block.std)
         begins[v] = e
         unfinished[v] = a < tail or e < stop
 

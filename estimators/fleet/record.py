@@ -11,6 +11,7 @@ from __future__ import annotations
 from ..gate.isolation import MAX_COMPARED_EVENTS
 from ..gate.rejection_runs import RUN
 from ..numerics.jit import embedded, ints, part
+from ..numerics.linalg import copy_vector
 from .memory import ASKED, FIRST, FLOOR, LAST, NEXT, PHASE, PINNED, REWOUND, N, record_at, state_at
 
 SPACING = 256
@@ -28,13 +29,6 @@ def record_sizes(recent: int) -> tuple[int, int]:
     spacing = max(SPACING, recent)
     rows = MAX_COMPARED_EVENTS + spacing + 4 * recent
     return rows // spacing + 2 + 2 * recent, rows
-
-
-@embedded
-def copy(source, target):
-    """Copy a vector."""
-    for k in range(source.size):
-        target[k] = source[k]
 
 
 @embedded
@@ -57,7 +51,7 @@ def store(record, n, state):
     head = record.head
     slot = head[NEXT] % record.at.size
     record.at[slot] = n
-    copy(state, record.snapshots[slot])
+    copy_vector(state, record.snapshots[slot])
     head[NEXT] += 1
     head[LAST] = n
 
@@ -67,7 +61,7 @@ def append(record, n, t, place, value):
     """Add event n."""
     k = (n - record.head[FIRST]) % record.t.size
     record.t[k], record.place[k] = t, place
-    copy(value, record.value[k])
+    copy_vector(value, record.value[k])
 
 
 @part

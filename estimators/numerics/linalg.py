@@ -217,10 +217,23 @@ def solve_unit(L, m, b):
 
 @part
 def congruence(F, rows, P, T):
-    """Overwrite symmetric P with F P Fᵀ, where F is the identity beyond its first `rows`; T (2n, n) is scratch."""
+    """Overwrite symmetric P with F P Fᵀ, where F is the identity beyond its first `rows`; T (2n, n) is scratch.
+
+    Beyond `rows` P stays, as do the covariances among what is there.
+    """
     n = P.shape[0]
     if rows < n:
-        bordered_congruence(F, rows, P, T)
+        multiply(F, rows, P, T)
+        for i in range(rows):
+            for j in range(i + 1):
+                s = 0.0
+                for k in range(n):
+                    s += T[i, k] * F[j, k]
+                P[i, j] = s
+                P[j, i] = s
+            for j in range(rows, n):
+                P[i, j] = T[i, j]
+                P[j, i] = T[i, j]
         return
     if n >= LANES:
         FP, PF = T[:n], T[n:]
@@ -231,15 +244,10 @@ def congruence(F, rows, P, T):
         multiply_rows(F, n, n, PF, 1, P)
         mirror(P)
         return
+    multiply(F, n, P, T)
     for i in range(n):
         for j in range(n):
-            T[i, j] = 0.0
             T[n + i, j] = F[j, i]
-        for k in range(n):
-            a = F[i, k]
-            if a != 0.0:
-                for j in range(n):
-                    T[i, j] += a * P[k, j]
     for i in range(n):
         for j in range(i + 1):
             P[i, j] = 0.0
@@ -251,29 +259,24 @@ def congruence(F, rows, P, T):
     mirror(P)
 
 
-@part
-def bordered_congruence(F, rows, P, T):
-    """Overwrite P with F P Fᵀ as `congruence`; beyond `rows` P stays, as do the covariances among what is there."""
-    n = P.shape[0]
+@inlined
+def multiply(A, rows, B, out):
+    """Leading rows of out = those of A B; few entries of A differ from zero."""
     for i in range(rows):
-        for j in range(n):
-            T[i, j] = 0.0
-        # A row depends on few of the states beyond.
-        for k in range(n):
-            a = F[i, k]
+        for j in range(B.shape[1]):
+            out[i, j] = 0.0
+        for k in range(B.shape[0]):
+            a = A[i, k]
             if a != 0.0:
-                for j in range(n):
-                    T[i, j] += a * P[k, j]
-    for i in range(rows):
-        for j in range(i + 1):
-            s = 0.0
-            for k in range(n):
-                s += T[i, k] * F[j, k]
-            P[i, j] = s
-            P[j, i] = s
-        for j in range(rows, n):
-            P[i, j] = T[i, j]
-            P[j, i] = T[i, j]
+                for j in range(B.shape[1]):
+                    out[i, j] += a * B[k, j]
+
+
+@embedded
+def copy_vector(a, b):
+    """b ← a, of which b may have more entries."""
+    for i in range(a.size):
+        b[i] = a[i]
 
 
 @inlined

@@ -13,7 +13,7 @@ from typing import Any
 
 from .simd_ir import LANES, Lanes, integer, steps, vector_code
 
-_NOTHING = 1e-300
+NOTHING = 1e-300
 """Below this a sum of squares may have lost its numbers to underflow: a row that small is zero."""
 
 
@@ -71,7 +71,7 @@ def find_reflection(v, n, k, A, d, e, inverses):
     d[k] = A[builder.add(row, k)]
     head = A[behind]
     (tail,) = _sums(v, builder.add(behind, integer(1)), builder.add(row, n), lambda i: [(A[i], A[i])], 1)
-    none = builder.fcmp_ordered("<", tail, v.constant(_NOTHING))
+    none = builder.fcmp_ordered("<", tail, v.constant(NOTHING))
     length = v.unary("sqrt", v.multiply_add(head, head, tail))
     length = builder.select(builder.fcmp_ordered(">", head, zero), builder.fneg(length), length)
     e[first] = builder.select(none, head, length)

@@ -14,15 +14,13 @@ import numpy as np
 from .jit import jit
 from .simd import add_outer, add_scaled, combine, combine_four, dot, rotate, subtract_four, subtract_one
 from .simd_ir import LANES
+from .simd_lanes import NOTHING
 
 _SWEEPS = 60
 """Iterations for one eigenvalue; two are usual, so this many mean that a number is not finite."""
 
 _PANEL = 32
 """Rows of a panel of the Cholesky factor."""
-
-_NOTHING = 1e-300
-"""Below this a sum of squares may have lost its numbers to underflow: a row that small is zero."""
 
 
 @jit
@@ -150,7 +148,7 @@ def tridiagonal(A, n, d, halves, scratch):
         head = A[k, k + 1]
         A[k, k + 1] = 0.0
         tail = dot(size, row, row)
-        if tail < _NOTHING:
+        if tail < NOTHING:
             e[k + 1] = head
             halves[k] = 0.0
             continue

@@ -39,7 +39,7 @@ from ..fold import Fold
 from ..log import INPUT, READING, RESET, Log
 from ..model.state_space import StateSpaceModel
 from ..numerics.jit import jit
-from ..numerics.linalg import root, wrap
+from ..numerics.linalg import copy_vector, root, wrap
 from ..track import USED, covariances
 from ..tuning import Tuning
 from .moments_back import MomentsBack
@@ -205,8 +205,7 @@ def shapes(context, x, u, dt, S, scratch):
         q[j] = 1.0
         S[j] = 0.0
         add_process_noise(context, x, u, dt, S[j], scratch)
-    for k in range(q.size):
-        q[k] = kept[k]
+    copy_vector(kept, q)
 
 
 @jit

@@ -30,7 +30,7 @@ from ..gaussian.shared import tell
 from ..interpreted.fold_loop import UNSET
 from ..log import INPUT, RESET
 from ..numerics.jit import B1, F1, F2, I1, borrowed, i64, inlined, jit
-from ..numerics.linalg import copy
+from ..numerics.linalg import copy, copy_vector
 from ..numerics.workspace import size_of
 from ..snapshots import Snapshot
 from .notes import STAYED, StepNote, changed, cut, join_moments, step_at, step_back, step_layout, widened
@@ -71,8 +71,7 @@ def note_query(code, context, row, t, clock, following, u, holds, state, work, t
     else:
         note.kind[0] = STAYED
         if t < following:
-            for j in range(own):
-                state[j] = note.state[j]
+            copy_vector(note.state, state)
             head = head_of(state)
             head[ROW] = row
             advance_to(code, context, u, t, following, row, state, work)
@@ -153,15 +152,13 @@ def backward(context, first, kind, tape, own, earlier, later, work, mean, std, c
             if note.kind[0] == HERE:
                 tell(context, earlier.x, earlier.P, mean[i], std[i], cross[i])
             else:
-                for j in range(n):
-                    x[j] = later.x[j]
+                copy_vector(later.x, x)
                 copy(later.P, Q)
                 step_back(context, note, x, Q, T, S)
                 tell(context, x, Q, mean[i], std[i], cross[i])
             continue
         tell(context, earlier.x, earlier.P, mean[i], std[i], cross[i])
-        for j in range(n):
-            later.x[j] = earlier.x[j]
+        copy_vector(earlier.x, later.x)
         copy(earlier.P, later.P)
         if lag.shape[0] > 0:
             join_moments(note, earlier.P, lag[i])

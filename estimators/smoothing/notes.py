@@ -24,7 +24,7 @@ from ..compiled.context import circular_states
 from ..events.maintenance import without
 from ..gaussian.shared import wrap_mean
 from ..numerics.jit import inlined, jit
-from ..numerics.linalg import copy, root, wrap
+from ..numerics.linalg import copy, copy_vector, multiply, root, wrap
 from ..numerics.workspace import declare_layout
 
 STAYED, MOVED, CUT = range(3)  # Effect of an event on the state before any update: none; predicted; restarted or lost
@@ -42,18 +42,6 @@ def step_at(tape, row, n, own):
     """Return a note of a tape that begins at an address."""
     first = step_layout(0, n, own)
     return step_layout(tape + row * first.end, n, own)
-
-
-@inlined
-def multiply(A, B, out):
-    """Fill out = A B of square matrices."""
-    n = A.shape[0]
-    for i in range(n):
-        for j in range(n):
-            s = 0.0
-            for k in range(n):
-                s += A[i, k] * B[k, j]
-            out[i, j] = s
 
 
 @inlined
@@ -86,17 +74,15 @@ def cut(own, x, P):
     own.kind[0] = CUT
     own.G[:] = 0.0
     copy(P, own.M)
-    for i in range(x.size):
-        own.before[i] = x[i]
-        own.after[i] = x[i]
+    copy_vector(x, own.before)
+    copy_vector(x, own.after)
 
 
 @jit
 def join(own, x, P, after, G, W, T):
     """Append a step from N(x, P) to the mean `after`, of this G and M = P - Wᵀ W, to the note of the event so far."""
     n = x.size
-    for i in range(n):
-        own.after[i] = after[i]
+    copy_vector(after, own.after)
     for i in range(n):
         for j in range(i + 1):
             s = P[i, j]
@@ -106,13 +92,12 @@ def join(own, x, P, after, G, W, T):
             P[j, i] = s
     if own.kind[0] == STAYED:
         own.kind[0] = MOVED
-        for i in range(n):
-            own.before[i] = x[i]
+        copy_vector(x, own.before)
         copy(G, own.G)
         copy(P, own.M)
         return
     turn(own.G, P, own.M, T)
-    multiply(own.G, G, T)
+    multiply(own.G, n, G, T)
     copy(T, own.G)
 
 
@@ -131,12 +116,7 @@ def finite(own):
 def turn(G, P, M, T):
     """M ← M + G P Gᵀ for symmetric P and M; T (nx, nx) is scratch."""
     n = P.shape[0]
-    T[:] = 0.0
-    for i in range(n):
-        for k in range(n):
-            a = G[i, k]
-            for j in range(n):
-                T[i, j] += a * P[k, j]
+    multiply(G, n, P, T)
     for i in range(n):
         for j in range(i + 1):
             s = M[i, j]
@@ -176,8 +156,7 @@ def step_back(context, note, x, P, T, S):
     if note.kind[0] == STAYED:
         return
     if note.kind[0] == CUT:
-        for i in range(n):
-            x[i] = note.before[i]
+        copy_vector(note.before, x)
         copy(note.M, P)
         return
     circular = circular_states(context)
@@ -204,7 +183,7 @@ def join_moments(note, P, out):
     Source: Särkkä, Bayesian Filtering and Smoothing (2013), theorem 12.4 and (12.49).
     """
     if note.kind[0] == MOVED:
-        multiply(note.G, P, out)
+        multiply(note.G, P.shape[0], P, out)
     elif note.kind[0] == STAYED:
         copy(P, out)
     else:

@@ -38,7 +38,7 @@ from ..gaussian.kf import constant_jacobian, kept
 from ..gaussian.shared import moments_of
 from ..gaussian.ukf import deviations, subtract_opposite, weights_of
 from ..numerics.jit import address, floats, inlined, ints, jit
-from ..numerics.linalg import copy, multiply_transposed, root
+from ..numerics.linalg import copy, copy_vector, multiply_transposed, root
 from ..numerics.simd_ir import padded
 from ..numerics.simd_rows import cross_covariance, factor, spread_points
 from ..numerics.workspace import declare_layout, size_of
@@ -231,8 +231,7 @@ def describe(context, state, mean, std, cross):
     head = head_of(state)
     own = own_of(head, state)
     row = step_at(head[TAPE], head[ROW], context.nx, own.size)
-    for i in range(own.size):
-        row.state[i] = own[i]
+    copy_vector(own, row.state)
     head[ROW] += 1
     ahead = step_at(head[TAPE], head[ROW], context.nx, own.size)
     ahead.kind[0] = STAYED
@@ -252,17 +251,14 @@ class StepRecorder:
         self._head[[OWN, RULE, HELD]] = own, *kind
         self._head[[TAPE, SCRATCH]] = self._tape.ctypes.data, self._scratch.ctypes.data
         self._nx, self._own = nx, own
+        self.tape = self._tape.ctypes.data
+        """The address of the rows."""
         self.code = Code(
             address(start, start_signature),
             address(predict, predict_signature),
             address(update, update_signature),
             address(describe, describe_signature),
         )
-
-    @property
-    def tape(self) -> int:
-        """The address of the rows."""
-        return self._tape.ctypes.data
 
     def around(self, state: np.ndarray) -> np.ndarray:
         """A recorder's state around that of a filter."""

@@ -187,7 +187,6 @@ class TrajectoriesBack:
         return np.asarray(X[self._rng(i).choice(len(w), TRAJECTORIES, p=w)])
 
     def _tell(self, i: int, at: np.ndarray) -> None:
-        """Fill a row."""
         off = wrapped(at - at[0], self._circular)
         mean = wrapped(at[0] + off.mean(axis=0), self._circular)
         cov = np.atleast_2d(np.cov(off.T))
