@@ -19,6 +19,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from .compiled.jacobians import CENTRAL_STEP
 from .events.batch import MARK, READING, TICK, Events
 from .numerics.linalg import wrapped
 
@@ -30,8 +31,6 @@ EVENT_S_PER_NUMBER = 50e-9
 
 MAX_NOISE_STATES = 256
 """States beyond which H Q Hᵀ is neglected: larger ones are ensembles, whose Q is too large to form."""
-
-_STEP = 6e-6
 
 
 def rewind_seconds(numbers: int, events: int) -> float:
@@ -56,7 +55,7 @@ def moved_variance(fold: Fold, sensor: int, delay: float) -> np.ndarray:
     if model.nx <= MAX_NOISE_STATES and made.box is None:
         Q = np.zeros((model.nx, model.nx))
         made.Q(X[0], u, p, np.asarray(fold.tuning.q, float), dt, Q)
-        h = _STEP * np.maximum(1.0, np.abs(x))
+        h = CENTRAL_STEP * np.maximum(1.0, np.abs(x))
         ends = made.h_block(sensor, X + np.diag(h), u, p), made.h_block(sensor, X - np.diag(h), u, p)
         H = ((ends[0] - ends[1]) / (2.0 * h[:, None])).T
         moved = moved + np.einsum("ij,jk,ik->i", H, Q, H) * (delay / dt)

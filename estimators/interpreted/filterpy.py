@@ -84,7 +84,7 @@ def describe(view: View, state: np.ndarray, mean: np.ndarray, std: np.ndarray, c
 def predict_kf(view: View, u: np.ndarray, dt: float, index: int, state: np.ndarray, work: np.ndarray) -> None:
     """x ← F x + c, P ← F P Fᵀ + Q, with c what f adds to F x: inputs, offsets."""
     filter_, x, _ = _at(objects().KalmanFilter(dim_x=view.nx, dim_z=1, dim_u=1), view, state)
-    F = view.F(view.prior()[0], u, dt)
+    F = view.F(view.prior[0], u, dt)
     offset = view.f(x[None], u, dt)[0] - F @ x
     filter_.predict(u=np.ones(1), B=offset[:, None], F=F, Q=view.Q(x, u, dt))
     start(view, filter_.x, filter_.P, state)
@@ -96,7 +96,7 @@ def update_kf(view: View, u: np.ndarray, sensor: int, y: np.ndarray, *rest: Any)
     def step(state: np.ndarray, rows: np.ndarray, R: np.ndarray) -> Any:
         filter_, x, _ = _at(objects().KalmanFilter(dim_x=view.nx, dim_z=rows.size), view, state)
         H = view.H(sensor, x, u)[rows]
-        nu = wrapped(y[rows] - view.h(sensor, x[None], u)[0, rows], view.circular_rows(sensor)[rows])
+        nu = wrapped(y[rows] - view.h(sensor, x[None], u)[0, rows], view.angles[sensor][rows])
         filter_.update(H @ x + nu, R=R, H=H)
         return filter_
 
@@ -117,7 +117,7 @@ def update_ekf(view: View, u: np.ndarray, sensor: int, y: np.ndarray, *rest: Any
 
     def step(state: np.ndarray, rows: np.ndarray, R: np.ndarray) -> Any:
         filter_, *_ = _at(objects().Extended(dim_x=view.nx, dim_z=rows.size), view, state)
-        angles = view.circular_rows(sensor)[rows]
+        angles = view.angles[sensor][rows]
         filter_.update(
             y[rows],
             lambda x: view.H(sensor, x, u)[rows],
@@ -175,7 +175,7 @@ def update_ukf(view: View, u: np.ndarray, sensor: int, y: np.ndarray, *rest: Any
     """Condition on a measurement, with sigma points drawn again from the prediction."""
 
     def step(state: np.ndarray, rows: np.ndarray, R: np.ndarray) -> Any:
-        filter_, x, P = _at(_unscented(view, view.circular_rows(sensor)[rows]), view, state)
+        filter_, x, P = _at(_unscented(view, view.angles[sensor][rows]), view, state)
         filter_.sigmas_f = filter_.points_fn.sigma_points(x, P)
         block = np.ascontiguousarray(view.h(sensor, filter_.sigmas_f, u)[:, rows])
         filter_.update(y[rows], R=R, hx=in_turn(block))
@@ -204,7 +204,7 @@ def _update(
     adopt: Callable[..., None] = lambda view, filter_, state: start(view, filter_.x, filter_.P, state),
 ) -> int:
     """Update a copy with FilterPy by the finite rows, judge its innovation, and `adopt` the copy if it is used."""
-    R = view.covariance(sensor)
+    R = view.R[sensor]
     rows = np.flatnonzero(np.isfinite(y[: len(R)]))
     if not rows.size:
         return MISSING
@@ -271,7 +271,7 @@ def update_enkf(view: View, u: np.ndarray, sensor: int, y: np.ndarray, *rest: An
 
     def step(state: np.ndarray, rows: np.ndarray, R: np.ndarray) -> Any:
         X, filter_ = _members(view, state), _enkf(view)
-        angles = view.circular_rows(sensor)[rows]
+        angles = view.angles[sensor][rows]
         expected = view.h(sensor, X, u)[:, rows]
         # FilterPy does not wrap differences, so angles are given within half a turn of one another.
         expected = expected[0] + wrapped(expected - expected[0], angles)

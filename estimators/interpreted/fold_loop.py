@@ -42,7 +42,7 @@ def _advance_to(
     if begun != UNSET and t > begun:
         dt = (t - begun) * 1e-9
         if dt > MAX_PREDICT_STEPS * context.max_step:
-            code.start(context, *context.prior(), state)
+            code.start(context, *context.prior, state)
         else:
             steps = steps_of(dt, context.max_step)
             for k in range(steps):
@@ -124,7 +124,7 @@ def run(
                     given = value[i, : u.size]
                     np.copyto(u, given, where=np.isfinite(given))
             elif what == RESET:
-                code.start(context, *context.prior(), state)
+                code.start(context, *context.prior, state)
                 forget(doubt)
                 clock[0] = now
             else:
@@ -163,7 +163,7 @@ def _soften(
     if not w < np.inf:
         return GATED
     nu, std, scored = innovation.copy(), innovation_std.copy(), score.copy()
-    with context.brought(sensor, w * context.variances(sensor)):
+    with context.brought(sensor, w * context.r[sensor]):
         verdict = int(code.update(*given, innovation, innovation_std, score))
     innovation[:], innovation_std[:] = nu, std
     if verdict == USED:

@@ -13,7 +13,7 @@ import numpy as np
 
 from ..compiled.black_box import ANSWER
 from ..compiled.context import with_parameters
-from ..compiled.jacobians import scratch_size, sensor_jacobian, state_jacobian
+from ..compiled.jacobians import CENTRAL_STEP, scratch_size, sensor_jacobian, state_jacobian
 from ..compiled.model import CompiledModel
 from ..errors import ModelError
 from ..estimator import Code, Estimator, Options
@@ -24,12 +24,12 @@ from ..numerics.linalg import wrapped
 from ..track import FAILED
 from ..tuning import Tuning
 
-_STEP = 6e-6
-"""Relative step of a central difference, about the cube root of the rounding error (see compiled/jacobians.py)."""
-
 
 class View:
     """Model, tuning and options of a filter, for its Python functions.
+
+    `prior` has mean (nx,) and covariance (nx, nx); for each sensor `r` has the variances of its rows (ny,), `R` their
+    covariance (ny, ny), and `angles` whether each is an angle.
 
     Only `kept`, the memory of filters, and the count and last of the model's failures change.
     """
@@ -49,15 +49,15 @@ class View:
         self.compiled, self.context, self.options, self.pairs = compiled, context, options, pairs
         self.nx, self.max_step, self.seed = model.nx, model.max_step, tuning.seed
         self.p, self.q = held["p"], held["q"]
-        self._prior = held["prior_mean"], held["prior_cov"]
+        self.prior = held["prior_mean"], held["prior_cov"]
         self.circular = np.asarray(model.circular, bool)
         self.shown = model.shown
         ends = [first + len(sensor.rows) for first, sensor in zip(model.row_start, model.sensors, strict=True)]
         rows = [slice(first, end) for first, end in zip(model.row_start, ends, strict=True)]
         angles = np.array([row.circular for sensor in model.sensors for row in sensor.rows], bool)
-        self._r = [held["r"][part] for part in rows]
-        self._angles = [angles[part] for part in rows]
-        self._R = [covariance_of(sensor.correlation, r) for sensor, r in zip(model.sensors, self._r, strict=True)]
+        self.r = [held["r"][part] for part in rows]
+        self.angles = [angles[part] for part in rows]
+        self.R = [covariance_of(sensor.correlation, r) for sensor, r in zip(model.sensors, self.r, strict=True)]
         self._scratch = np.empty(scratch_size(model.nx, model.width))
         self.kept: dict[Any, Any] = {}
         self.failures = 0
@@ -69,33 +69,17 @@ class View:
         # The frames of its traceback hold the filter's arrays.
         self.failure = error.with_traceback(None)
 
-    def prior(self) -> tuple[np.ndarray, np.ndarray]:
-        """Return mean (nx,) and covariance (nx, nx) of the prior."""
-        return self._prior
-
-    def covariance(self, sensor: int) -> np.ndarray:
-        """Return R (ny, ny), the covariance of a sensor's rows."""
-        return self._R[sensor]
-
-    def variances(self, sensor: int) -> np.ndarray:
-        """Return r (ny,), the variances of a sensor's rows."""
-        return self._r[sensor]
-
     @contextmanager
     def brought(self, sensor: int, own: np.ndarray) -> Iterator[None]:
         """Context manager: replace R by a measurement's own variances (ny or more,); NaN leaves the tuned one."""
-        r, tuned = self._r[sensor], (self._r[sensor].copy(), self._R[sensor])
+        r, tuned = self.r[sensor], (self.r[sensor].copy(), self.R[sensor])
         own = own[: len(tuned[1])]
         np.copyto(r[: own.size], own, where=np.isfinite(own))
-        self._R[sensor] = covariance_of(self.compiled.model.sensors[sensor].correlation, r)
+        self.R[sensor] = covariance_of(self.compiled.model.sensors[sensor].correlation, r)
         try:
             yield
         finally:
-            r[:], self._R[sensor] = tuned
-
-    def circular_rows(self, sensor: int) -> np.ndarray:
-        """Return for each row of a sensor whether it is an angle."""
-        return self._angles[sensor]
+            r[:], self.R[sensor] = tuned
 
     def f(self, X: np.ndarray, u: np.ndarray, dt: float) -> np.ndarray:
         """Return f of every state of a block X (N, nx) over dt seconds."""
@@ -116,13 +100,13 @@ class View:
     def H(self, sensor: int, x: np.ndarray, u: np.ndarray) -> np.ndarray:
         """Return dh/dx (ny, nx) of a sensor at a state."""
         if self.model.black_box:
-            return self._differences(lambda X: self.h(sensor, X, u), x, self._angles[sensor])
-        H = np.empty((self._r[sensor].size, self.nx))
+            return self._differences(lambda X: self.h(sensor, X, u), x, self.angles[sensor])
+        H = np.empty((self.r[sensor].size, self.nx))
         sensor_jacobian(self.context, sensor, np.ascontiguousarray(x), u, H, self._scratch)
         return H
 
     def _differences(self, function: Any, x: np.ndarray, circular: np.ndarray) -> np.ndarray:
-        step = np.diag(_STEP * np.maximum(1.0, np.abs(x)))
+        step = np.diag(CENTRAL_STEP * np.maximum(1.0, np.abs(x)))
         above, below = x + step, x - step
         images = function(np.vstack((above, below)))
         D = wrapped(images[: self.nx] - images[self.nx :], circular)
@@ -145,7 +129,7 @@ class View:
         score: np.ndarray,
     ) -> int:
         """Return the verdict on the innovation nu (m,) of the finite rows, of covariance S (m, m)."""
-        rows = np.isfinite(y[: self._r[sensor].size])
+        rows = np.isfinite(y[: self.r[sensor].size])
         innovation[: rows.size][rows] = nu
         innovation_std[: rows.size][rows] = np.sqrt(np.diag(S))
         if not np.all(np.isfinite(S)):

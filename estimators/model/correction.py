@@ -68,11 +68,6 @@ class GaussianProcess:
         explained = np.sum((self._near(z) @ self.data[3].T) ** 2, axis=1)
         return np.clip(1.0 - explained, 0.0, 1.0)
 
-    @property
-    def functions(self) -> tuple[Callable, Callable, Callable]:
-        """Plain functions to compile: they add m, add its slope, and return s."""
-        return process_add, process_slope, process_share
-
 
 @dataclass(frozen=True, eq=False)
 class Ridge:
@@ -119,11 +114,6 @@ class Ridge:
         left = np.minimum(1.0, np.einsum("ni,ij,nj->n", phi, C, phi))
         return 1.0 - weight(z, self.data) * (1.0 - left)
 
-    @property
-    def functions(self) -> tuple[Callable, Callable, Callable]:
-        """Plain functions to compile: they add m, add its slope, and return s."""
-        return ridge_add, ridge_slope, ridge_share
-
 
 @dataclass(frozen=True, eq=False)
 class Net:
@@ -147,11 +137,6 @@ class Net:
     def share(self, z: np.ndarray) -> np.ndarray:
         """Return s (N,) at features z (N, d)."""
         return 1.0 - weight(z, self.data)
-
-    @property
-    def functions(self) -> tuple[None, None, Callable]:
-        """Only s is compiled."""
-        return None, None, net_share
 
 
 Correction = GaussianProcess | Ridge | Net
@@ -308,3 +293,11 @@ def net_share(x, u, place, data):
     """s."""
     z = np.empty(place.size)
     return 1.0 - _weight(_standard(x, u, place, data, z), data[3][0])
+
+
+FUNCTIONS: dict[type, tuple[Callable | None, Callable | None, Callable]] = {
+    GaussianProcess: (process_add, process_slope, process_share),
+    Ridge: (ridge_add, ridge_slope, ridge_share),
+    Net: (None, None, net_share),
+}
+"""Plain functions to compile, by kind of correction: they add m, add its slope, and return s."""

@@ -19,7 +19,7 @@ from typing import Any
 import numpy as np
 
 from ..errors import ModelError, nearest
-from .correction import Correction
+from .correction import FUNCTIONS, Correction
 from .state_space import LARGE, Field, Noise, Sensor, StateSpaceModel, squared
 from .wrapping import as_inner, noise_function
 
@@ -63,7 +63,7 @@ def hybrid(model: StateSpaceModel, learned: LearnedCorrection) -> StateSpaceMode
         linear=model.linear and not moved,
         conditionally_linear=tuple(name for name in model.conditionally_linear if name not in moved),
     )
-    add_rate, add_slope, _ = learned.correction.functions
+    add_rate, add_slope, _ = FUNCTIONS[type(learned.correction)]
     if model.black_box or add_rate is None:
         f = _step_of_blocks(model.f, model.black_box, *given)
         return replace(changed, f=f, sensors=_block_sensors(model), black_box=True, linear=False)
@@ -135,7 +135,7 @@ def _added(
 def _noise(
     function: Callable, m: int, learned: LearnedCorrection, place: tuple[int, ...], target: tuple[int, ...]
 ) -> Callable:
-    inner, share = as_inner(function), as_inner(learned.correction.functions[2])
+    inner, share = as_inner(function), as_inner(FUNCTIONS[type(learned.correction)][2])
     features, states, data = np.array(place), np.array(target), learned.correction.data
 
     def Q(x, u, p, q, dt, out):  # noqa: ANN001, ANN202

@@ -55,4 +55,4 @@ def test_a_view_has_the_numbers_of_the_context():
         np.testing.assert_allclose(view.H(k, X[0], u), matrices.H[k], rtol=1e-13)
         expected = X @ matrices.H[k].T + matrices.D[k] @ u
         np.testing.assert_allclose(view.h(k, X, u), expected, rtol=1e-13, atol=1e-13)
-        np.testing.assert_array_equal(np.diag(view.covariance(k)), matrices.R[k])
+        np.testing.assert_array_equal(np.diag(view.R[k]), matrices.R[k])
