@@ -94,7 +94,7 @@ def linear_model(
     whole, made, first = _rows(M), [], 0
     for sensor, rows in sensors:
         own = slice(first, first + len(rows))
-        h, H = _measurement(_rows(C[own]), _rows(D[own]))
+        h, H = _measurement(_rows(np.hstack((C[own], D[own]))))
         made.append(Sensor(sensor, tuple(rows), h=h, H=H))
         first = own.stop
     return StateSpaceModel(
@@ -106,8 +106,8 @@ def linear_model(
             Noise(state.name, f"{squared(state.unit)}/s", float(value)) for state, value in zip(states, q, strict=True)
         ),
         sensors=tuple(made),
-        f=_step(whole, nx),
-        F=_slope(whole, nx),
+        f=_step(whole),
+        F=_slope(whole),
         Q=_noise(whole, nx),
         linear=True,
     )
@@ -250,34 +250,44 @@ def integral(A, q, dt, out):
         double_growth(G, other)
 
 
+def weigh(M, x, u, out):
+    """Fill out = M [x, u], for as many rows as out has."""
+    for i in range(out.size):
+        s = M[i, 0] * x[0]
+        for j in range(1, x.size):
+            s += M[i, j] * x[j]
+        for j in range(u.size):
+            s += M[i, x.size + j] * u[j]
+        out[i] = s
+
+
+def lead(M, out):
+    """Fill out with the leading rows and columns of M."""
+    for i in range(out.shape[0]):
+        for j in range(out.shape[1]):
+            out[i, j] = M[i, j]
+
+
 @lru_cache(maxsize=64)
-def _step(whole: Rows, nx: int):  # noqa: ANN202
+def _step(whole: Rows):  # noqa: ANN202
     M = np.array(whole)
 
     def f(x, u, p, dt, out):  # noqa: ANN001, ANN202
         E = np.empty(M.shape)
         exponential(M, dt, E)
-        for i in range(nx):
-            s = E[i, 0] * x[0]
-            for j in range(1, nx):
-                s += E[i, j] * x[j]
-            for j in range(u.size):
-                s += E[i, nx + j] * u[j]
-            out[i] = s
+        weigh(E, x, u, out)
 
     return f
 
 
 @lru_cache(maxsize=64)
-def _slope(whole: Rows, nx: int):  # noqa: ANN202
+def _slope(whole: Rows):  # noqa: ANN202
     M = np.array(whole)
 
     def F(x, u, p, dt, out):  # noqa: ANN001, ANN202
         E = np.empty(M.shape)
         exponential(M, dt, E)
-        for i in range(nx):
-            for j in range(nx):
-                out[i, j] = E[i, j]
+        lead(E, out)
 
     return F
 
@@ -293,22 +303,13 @@ def _noise(whole: Rows, nx: int):  # noqa: ANN202
 
 
 @lru_cache(maxsize=1024)
-def _measurement(of_states: Rows, of_inputs: Rows):  # noqa: ANN202
-    C = np.array(of_states)
-    D = np.array(of_inputs).reshape(len(of_states), -1)
+def _measurement(rows: Rows):  # noqa: ANN202
+    M = np.array(rows)
 
     def h(x, u, p, out):  # noqa: ANN001, ANN202
-        for i in range(C.shape[0]):
-            s = C[i, 0] * x[0]
-            for j in range(1, C.shape[1]):
-                s += C[i, j] * x[j]
-            for j in range(D.shape[1]):
-                s += D[i, j] * u[j]
-            out[i] = s
+        weigh(M, x, u, out)
 
     def H(x, u, p, out):  # noqa: ANN001, ANN202
-        for i in range(C.shape[0]):
-            for j in range(C.shape[1]):
-                out[i, j] = C[i, j]
+        lead(M, out)
 
     return h, H
