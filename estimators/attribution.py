@@ -85,7 +85,6 @@ def attribution(fold: Fold, since: int, until: int) -> Attribution:
     n, defaults = len(model.shown), model.default_inputs
     own, restarts = np.zeros(n), np.zeros(n)
     inputs, sensors = np.zeros((model.nu, n)), np.zeros((len(model.sensors), n))
-    readings = np.zeros(len(model.sensors), np.int64)
     corrections: list[tuple[int, int, np.ndarray]] = []
     mean = before = fold.described()
     for i in range(first, end):
@@ -109,7 +108,6 @@ def attribution(fold: Fold, since: int, until: int) -> Attribution:
         if kind == READING:
             change = difference(updated, mean)
             sensors[log.channel[i]] += change
-            readings[log.channel[i]] += 1
             corrections.append((int(t[i]), int(log.channel[i]), change))
         if not plain or kind in (RESET, MAINTENANCE):
             mean, updated = updated, fold.described()
@@ -125,5 +123,6 @@ def attribution(fold: Fold, since: int, until: int) -> Attribution:
         )
         for j in range(n)
     )
+    readings = np.bincount(np.array([sensor for _, sensor, _ in corrections], int), minlength=len(model.sensors))
     times = int(t[first - 1]), int(t[end - 1])
     return Attribution(times, before, mean, own, inputs, sensors, restarts, readings, largest)

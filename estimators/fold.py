@@ -242,7 +242,9 @@ class Fold:
             stop = min(end, boundaries[-1])
             if self.pictures is not None:
                 stop = self.pictures.next(log, self.n, stop)
-            stop = self._maintenance(stop)
+            # A maintenance event is handled by itself. For one event at a time, NumPy takes longer than a filter step.
+            found = log.kind[self.n : stop].tobytes().find(MAINTENANCE)
+            stop = stop if found < 0 else self.n + max(1, found)
             begun_at, changed = self.n, False
             try:
                 if log.kind[self.n] == MAINTENANCE:
@@ -302,12 +304,6 @@ class Fold:
         asking = self.machine.run(self.log, start, stop, self._now, self._spare, self._rows, blanks)
         self._asked = stop - 1 if asking < 0 else -1
         return asking
-
-    def _maintenance(self, stop: int) -> int:
-        """Return where to stop, at most `stop`, so that a maintenance event is handled by itself."""
-        # A search of bytes: for one event at a time, NumPy takes longer than a filter step.
-        found = self.log.kind[self.n : stop].tobytes().find(MAINTENANCE)
-        return stop if found < 0 else self.n + max(1, found)
 
     def _maintain(self, i: int) -> None:
         """Predict to a maintenance event and reset the variance of its state to the prior's; the mean stays.

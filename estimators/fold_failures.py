@@ -39,7 +39,8 @@ def cause_of(fold: Fold, row: int) -> str | None:
     predicted = None
     if len(model.shown) == model.nx and np.all(np.isfinite(track.mean[row]) & np.isfinite(track.std[row])):
         predicted = Estimate(track.mean[row].copy(), track.std[row])
-    return cause(fold.compiled, Estimate(x, std), u, *_tuned(fold), dt, sensor, predicted)
+    held = fold.machine.held
+    return cause(fold.compiled, Estimate(x, std), u, held["p"], held["q"], dt, sensor, predicted)
 
 
 def questions_of(fold: Fold) -> Iterator[tuple[str, Callable[[], object]]]:
@@ -58,9 +59,4 @@ def questions_of(fold: Fold) -> Iterator[tuple[str, Callable[[], object]]]:
     dt = (int(ahead[0]) - then) * 1e-9 if ahead.size and then != UNSET else 0.0
     # The fold crosses the time in equal steps of at most `max_step`.
     dt /= max(1, int(np.ceil(dt / fold.model.max_step)))
-    return questions(fold.compiled, finite, fold.u, *_tuned(fold), dt)
-
-
-def _tuned(fold: Fold) -> tuple[np.ndarray, np.ndarray]:
-    """Return parameters and process variances as contiguous float64 arrays."""
-    return np.ascontiguousarray(fold.tuning.p, float), np.ascontiguousarray(fold.tuning.q, float)
+    return questions(fold.compiled, finite, fold.u, fold.machine.held["p"], fold.machine.held["q"], dt)

@@ -121,7 +121,11 @@ def forecast(
                 watch.members(points, fold.track.mean[-1])
         between()
         mean, std = fold.track.mean[-1], fold.track.std[-1]
-        bands[k] = _quantiles(points[:, model.shown], mean, model) if by_members else mean + np.outer(SIGMAS, std)
+        if by_members:
+            off = wrapped(points[:, model.shown] - mean, model.circular[model.shown])
+            bands[k] = mean + np.quantile(off, ndtr(SIGMAS), axis=0)
+        else:
+            bands[k] = mean + np.outer(SIGMAS, std)
         watch.moments(mean, std, by_members)
     last = rows[::each] - 1
     t = (instants[::each] - now) * 1e-9
@@ -163,12 +167,6 @@ def _future(model: StateSpaceModel, base: Base, instants: np.ndarray, inputs: Ev
     nothing = np.full((n, model.width), np.nan)
     steps = Events(instants, instants, np.full(n, INPUT, np.int8), np.zeros(n, np.int32), nothing)
     return Log.resume(model, base, steps if inputs is None else Events.concat([steps, inputs], model.width))
-
-
-def _quantiles(points: np.ndarray, mean: np.ndarray, model: StateSpaceModel) -> np.ndarray:
-    """Return quantiles (4, shown) of members (k, shown) at `SIGMAS`, about their mean (shown,); angles are wrapped."""
-    off = wrapped(points - mean, [state.circular for state in model.shown_states])
-    return mean + np.quantile(off, ndtr(SIGMAS), axis=0)
 
 
 class _Watch:

@@ -157,10 +157,8 @@ class Snapshots:
 
     def forget_after(self, at: int) -> None:
         """Drop the snapshots after `at`, whose events will be folded again."""
-        for key in [key for key in self._kept if key > at]:
-            del self._kept[key]
+        self._kept = {key: kept for key, kept in self._kept.items() if key <= at}
 
     def forget_before(self, at: int) -> None:
         """Drop the snapshots before `at`, whose events have been dropped."""
-        for key in [key for key in self._kept if key < at]:
-            del self._kept[key]
+        self._kept = {key: kept for key, kept in self._kept.items() if key >= at}

@@ -178,7 +178,8 @@ class Tuning:
                 raise ConfigError(f"{key} is {number:g}; it must be {LARGEST:g} at most")
             if group == "q" and number < 0:
                 raise ConfigError(f"{key} is {number:g}; a variance must be zero or positive")
-            if group == "r" and not (number > 0 or number == 0 and self._without_noise(index)):
+            # All filters of a model support zero noise only where it declares that.
+            if group == "r" and not (number > 0 or number == 0 and not np.any(Tuning.of(self.model).r[index])):
                 raise ConfigError(
                     f"{key} is {number:g}; a variance must be positive, or zero where the model declares zero noise"
                 )
@@ -212,11 +213,6 @@ class Tuning:
         changed = replace(self, version=next(_versions), name=name, **entries)
         vars(changed)["_places"] = self._places  # of the model: hundreds of kept runs share it
         return changed
-
-    def _without_noise(self, rows: Any) -> bool:
-        """Return whether the model declares zero noise for these rows; only then do all its filters support it."""
-        declared = np.array([row.variance for sensor in self.model.sensors for row in sensor.rows])
-        return not np.any(declared[rows])
 
     @cached_property
     def _places(self) -> dict[str, tuple[str, int]]:

@@ -21,6 +21,7 @@ from ..model.check import place
 from ..model.state_space import StateSpaceModel
 from ..model.user_file import portable
 from ..numerics.jit import floats, inlined
+from ..numerics.linalg import copy_vector
 from .orphan import leave_with_parent
 
 ANSWER = 2
@@ -33,8 +34,7 @@ def _answer(x, p, out):
     k = p.size - ANSWER
     member = (x.ctypes.data - int(p[k])) // (8 * x.size)
     answer = floats(int(p[k + 1]) + 8 * member * out.size, out.size)
-    for j in range(out.size):
-        out[j] = answer[j]
+    copy_vector(answer, out)
 
 
 def answered_f(x, u, p, dt, out):
@@ -86,7 +86,8 @@ class BlackBox:
         here = executor == "processes" and current_process().daemon
         pool = None if here else _pool(executor) if isinstance(executor, str) else executor
         # Of a number that does not depend on where they run: blocks of another size may round differently.
-        pieces = [X] if executor is None else np.array_split(X, max(1, min(_workers(pool), len(X))))
+        workers = int(getattr(pool, "_max_workers", numba.config.NUMBA_NUM_THREADS))
+        pieces = [X] if executor is None else np.array_split(X, max(1, min(workers, len(X))))
         try:
             if pool is None:
                 parts = [_call(function, piece, *rest) for piece in pieces]
@@ -156,9 +157,8 @@ def _call(function: Callable, X: np.ndarray, u: np.ndarray, p: np.ndarray, *rest
     return np.asarray(function(*given, *rest), float)
 
 
-@lru_cache(maxsize=2)
-def _pool(kind: str) -> Executor:
-    """Return the pool of threads or processes that all models share."""
+def pool_of(kind: str) -> Executor:
+    """Return a pool of threads or processes, as many as there are processors."""
     count = int(numba.config.NUMBA_NUM_THREADS)
     # Spawned, not forked: a fork would copy the locks of threads that it does not copy.
     if kind == "threads":
@@ -166,8 +166,8 @@ def _pool(kind: str) -> Executor:
     return ProcessPoolExecutor(count, get_context("spawn"), initializer=leave_with_parent)
 
 
-def _workers(pool: Executor | None) -> int:
-    return int(getattr(pool, "_max_workers", numba.config.NUMBA_NUM_THREADS))
+_pool = lru_cache(maxsize=2)(pool_of)
+"""The pools that all models share."""
 
 
 def _remedy(error: BaseException, sent: Callable | None) -> str:

@@ -107,7 +107,6 @@ def _numbers(name: str, values: Any) -> np.ndarray:
 
 
 def _rows(name: str, values: Any, n: int, rows: int) -> np.ndarray:
-    """Return values as (n, rows)."""
     y = _numbers(name, values)
     if y.ndim == 0 and rows == 1:
         y = np.full((n, 1), float(y))

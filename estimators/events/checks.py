@@ -152,7 +152,6 @@ def _integers(name: str, column: np.ndarray, wanted: type) -> np.ndarray:
 
 
 def _broken(batch: Events, at: int, rule: int, width: int, layout: EventLayout | None) -> str:
-    """Return the flaw of an event and its remedy."""
     t, kind, channel = int(batch.t[at]), int(batch.kind[at]), int(batch.channel[at])
     value = batch.value[at]
     if rule == TIME:

@@ -256,7 +256,6 @@ def fit(
 
 
 def _identified(objective: Objective, shape: LikelihoodCurvature) -> np.ndarray:
-    """Return the mask of the entries that the data identify, (k,)."""
     return shape.deviation <= MAX_DEVIATION * np.array([item.deviation for item in objective.entries])
 
 

@@ -344,7 +344,6 @@ def _gain(one: PartScore, other: PartScore, aim: Aim) -> tuple[float, float]:
 
 
 def _against(what: str, old: PredictionScore, new: PredictionScore) -> list[str]:
-    """Return the reasons against a new prediction."""
     if old.n != new.n:
         return [f"{what}: {abs(old.n - new.n)} readings could not be predicted"]
     return [*worse(what, old, new), *narrower(what, old, new)]

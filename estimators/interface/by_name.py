@@ -13,19 +13,17 @@ Names become a `Tuning`, and the fold is the one that live twins run.
 from __future__ import annotations
 
 from collections.abc import Iterable, Mapping, Sequence
-from concurrent.futures import Executor, ProcessPoolExecutor, ThreadPoolExecutor
+from concurrent.futures import Executor
 from contextlib import nullcontext
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 from importlib import import_module
-from multiprocessing import get_context
 from pickle import PicklingError
 from typing import Any
 
-import numba
 import numpy as np
 
-from ..compiled.orphan import leave_with_parent
+from ..compiled.black_box import pool_of
 from ..diagnostics.consistency import Nees, nees
 from ..diagnostics.episodes import Episode, JudgedRows, episodes_of
 from ..diagnostics.health import HealthPolicy
@@ -192,12 +190,8 @@ def _pool(executor: Executor | str | None) -> Any:
     """Return a context manager for an executor, which it shuts down if it created it; or for None."""
     if executor is None or isinstance(executor, Executor):
         return nullcontext(executor)
-    count = int(numba.config.NUMBA_NUM_THREADS)
-    if executor == "threads":
-        return ThreadPoolExecutor(count)
-    if executor == "processes":
-        # Spawned, not forked: a fork would copy the locks of threads that it does not copy.
-        return ProcessPoolExecutor(count, get_context("spawn"), initializer=leave_with_parent)
+    if executor in ("threads", "processes"):
+        return pool_of(executor)
     raise EstimatorError(
         f"fold_many: executor is {executor!r}; it must be 'threads', 'processes', None or a concurrent.futures.Executor"
     )
