@@ -13,7 +13,7 @@ from estimators.errors import ConfigError
 from estimators.fit.entries import Setting
 from estimators.fit.judge import PartScore, worths
 from estimators.fit.recording import Recording, held_out_rows
-from estimators.learned.train import NET, Trained, against, known, on_held_out, on_windows, train
+from estimators.learned.train import NET, Trained, against, on_windows, train
 from estimators.learned.windows import Windows, known_states, windows
 from estimators.model.hybrid import check_places
 from estimators.model.state_space import StateSpaceModel
@@ -110,8 +110,8 @@ def learn_correction(arguments: Arguments) -> int:
         corrects=corrects,
         units=tuple(physics.states[physics.state_names.index(name)].unit for name in corrects),
         words=trained.words,
-        learned_from=on_windows(own, trained.rest, known(trained, own)),
-        held_out=on_held_out(trained, apart) if len(apart.start) else None,
+        learned_from=on_windows(trained, own, trained.rest),
+        held_out=on_windows(trained, apart) if len(apart.start) else None,
         parts=tuple(parts),
         noise=own_noise,
         reasons=against(parts[:2], parts[2], corrects),

@@ -15,7 +15,6 @@ from __future__ import annotations
 
 import warnings
 from collections.abc import Callable, Iterator, Sequence
-from functools import partial
 from typing import NamedTuple
 
 import numpy as np
@@ -142,11 +141,10 @@ def _candidates(kind: str, given: Windows, degree: int, net: Callable | None) ->
         for reach in REACHES:
             for ratio in RATIOS:
                 words = f"length scales of {reach:g} deviations, noise ratio {ratio:g}"
-                yield Candidate(words, partial(_process, reach, ratio))
-
-
-def _process(reach: float, ratio: float, given: Windows) -> GaussianProcess:
-    return GaussianProcess(given.features, given.rates, reach * given.features.std(axis=0), ratio)
+                process = lambda part, reach=reach, ratio=ratio: GaussianProcess(  # noqa: E731
+                    part.features, part.rates, reach * part.features.std(axis=0), ratio
+                )
+                yield Candidate(words, process)
 
 
 def _likeliest(given: Windows) -> GaussianProcess:
@@ -179,21 +177,12 @@ class OnWindows(NamedTuple):
     known: float
 
 
-def known(trained: Trained, given: Windows) -> float:
-    """Return the mean share of a correction's prior variance that its training data explain in some windows."""
-    return 1.0 - float(np.mean(trained.correction.share(given.features)))
-
-
-def on_windows(given: Windows, rest: np.ndarray, share: float) -> OnWindows:
-    """Return the errors in windows where the correction left `rest` (M, k), with that explained share."""
-    both = given.rates, rest
-    first, second = (np.sqrt(np.mean(rates**2, axis=0)) for rates in both)
-    return OnWindows(len(rest), (first, second), (drift(given, both[0]), drift(given, both[1])), share)
-
-
-def on_held_out(trained: Trained, given: Windows) -> OnWindows:
-    """Return the errors in windows that took no part in the training."""
-    return on_windows(given, given.rates - trained.correction.mean(given.features), known(trained, given))
+def on_windows(trained: Trained, given: Windows, rest: np.ndarray | None = None) -> OnWindows:
+    """Return the errors in windows where the correction left `rest` (M, k); None if they took no part in training."""
+    rest = given.rates - trained.correction.mean(given.features) if rest is None else rest
+    first, second = (np.sqrt(np.mean(rates**2, axis=0)) for rates in (given.rates, rest))
+    share = 1.0 - float(np.mean(trained.correction.share(given.features)))
+    return OnWindows(len(rest), (first, second), (drift(given, given.rates), drift(given, rest)), share)
 
 
 def against(physics: Sequence[PartScore], corrected: PartScore, states: Sequence[str]) -> tuple[str, ...]:
