@@ -23,13 +23,6 @@ _SMALL = 1e-13
 
 
 @jit
-def _not_semidefinite(L):
-    """Fill L with NaN, so that the failure shows in every result."""
-    L[:] = np.nan
-    return False
-
-
-@jit
 def semidefinite_root(A, L):
     """Factor a positive semidefinite A (n, n) = L Lᵀ with lower L; return False (and L of NaN) if A is not.
 
@@ -45,7 +38,8 @@ def semidefinite_root(A, L):
             pivot -= L[j, k] * L[j, k]
         # Written so that NaN fails too.
         if not pivot >= -1e-8 * abs(A[j, j]):
-            return _not_semidefinite(L)
+            L[:] = np.nan  # so that the failure shows in every result
+            return False
         root = np.sqrt(pivot) if pivot > _SMALL * n * A[j, j] else 0.0
         L[j, j] = root
         for i in range(j + 1, n):
@@ -56,7 +50,8 @@ def semidefinite_root(A, L):
                 L[i, j] = s / root
             # No variance left in j, so no covariance either. Roots apart: a product of tiny variances would underflow.
             elif not abs(s) <= 1e-6 * np.sqrt(A[i, i]) * np.sqrt(A[j, j]):
-                return _not_semidefinite(L)
+                L[:] = np.nan
+                return False
     return True
 
 

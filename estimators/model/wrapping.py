@@ -69,8 +69,7 @@ def indicator(model: StateSpaceModel) -> StateSpaceModel:
 
 @lru_cache(maxsize=32)
 def _indicator(model: StateSpaceModel) -> StateSpaceModel:
-    if model.jump is None:
-        return model
+    assert model.jump is not None
     j, count = model.mode, len(model.jump.modes)
     return replace(
         model,

@@ -189,12 +189,7 @@ def thermometer(name: str, node: int) -> Sensor:
 MOTOR_DRIVE = StateSpaceModel(
     name="motor_drive",
     title="Permanent-magnet motor, temperatures of winding, tooth, yoke and magnet",
-    states=(
-        State("winding", "°C", mean=40.0, std=10.0),
-        State("tooth", "°C", mean=40.0, std=10.0),
-        State("yoke", "°C", mean=40.0, std=10.0),
-        State("magnet", "°C", mean=40.0, std=10.0),
-    ),
+    states=tuple(State(node, "°C", mean=40.0, std=10.0) for node in ("winding", "tooth", "yoke", "magnet")),
     inputs=(
         Input("i_d", "A"),
         Input("i_q", "A"),
