@@ -161,8 +161,8 @@ class Machine:
         left = [(now.edge, base.edge)]
         if base.estimator == self.estimator.name and base.state is not None and base.state.size == now.state.size:
             left += [(now.state, base.state), (now.doubt, base.doubt)]
-            if base.evidence is not None:
-                # A fleet follows no memory of the states, which comes last.
+            # A fleet follows no memory of the states, which comes last.
+            if base.evidence is not None and base.evidence.size in (now.evidence.size, fresh(self.model).size):
                 left += [(now.evidence[: base.evidence.size], base.evidence)]
         for mine, its in left:
             if its is not None and its.shape == mine.shape:
