@@ -9,11 +9,14 @@ from estimators.diagnostics.detectors import memory_flag
 from estimators.diagnostics.health import HealthPolicy
 from estimators.diagnostics.memory import fresh_memory, level_of, memory_of
 from estimators.diagnostics.references import HALF_WIDTH, own_grades, state_health
-from estimators.log import INPUT, READING, RESET
+from estimators.fleet.fleet import Fleet
+from estimators.fold import Fold
+from estimators.log import INPUT, READING, RESET, Log
 from estimators.model.state_space import Input, Noise, Row, Sensor, State, StateSpaceModel
 from estimators.numerics.jit import plain
 from estimators.numerics.workspace import size_of, view
 from estimators.track import SUSPECT
+from estimators.tuning import Tuning
 from tests.support import folded, log_of
 
 
@@ -131,3 +134,12 @@ def test_a_reset_begins_again():
     log.extend(log_of(CELL.width, (4000, RESET, 0.0)).events)
     flags = folded("kf", CELL, log).track.flags
     assert flags[-2] & memory_flag(0) and not flags[-1]
+
+
+def test_a_fold_from_an_asset_of_a_fleet_keeps_the_state_of_its_detectors():
+    fleet = Fleet("kf", CELL, assets=1)
+    fleet.add("voltage", np.zeros(9, int), np.arange(9.0), np.linspace(0.4, 0.6, 9))
+    fleet.advance()
+    base = fleet.base(0)
+    evidence = Fold("kf", CELL, Tuning.of(CELL), Log.of(CELL), base=base).evidence
+    np.testing.assert_array_equal(evidence, np.append(base.evidence, fresh_memory(CELL)))
