@@ -15,6 +15,7 @@ from ..log import READING, Events
 from ..model.state_space import StateSpaceModel
 from ..numerics.quantiles import chi_square_quantile, normal_quantile
 from ..track import (
+    ADVISORY,
     DEGRADED,
     DIVERGED,
     GATED,
@@ -263,8 +264,8 @@ def health_of(events: Events, track: Track, policy: HealthPolicy, hidden: np.nda
     seconds = np.bincount(track.health, held, len(HEALTH_NAMES))
     later = held
     for limit, code, better in (
-        (policy.stale_after, STALE, (TRACKING, SUSPECT, DEGRADED, DIVERGED)),
-        (policy.degraded_after, DEGRADED, (TRACKING, SUSPECT)),
+        (policy.stale_after, STALE, (TRACKING, ADVISORY, SUSPECT, DEGRADED, DIVERGED)),
+        (policy.degraded_after, DEGRADED, (TRACKING, ADVISORY, SUSPECT)),
     ):
         # Of the time that a row holds, that beyond the limit; what is stale is not degraded as well.
         beyond = np.clip(track.age + later - limit, 0.0, later) * np.isin(track.health, better)

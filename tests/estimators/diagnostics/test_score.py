@@ -5,9 +5,10 @@ import pytest
 from scipy.stats import chi2, f, multivariate_t
 
 from estimators.diagnostics.field_pictures import Picture
-from estimators.diagnostics.score import score
+from estimators.diagnostics.health import HealthPolicy
+from estimators.diagnostics.score import health_of, score
 from estimators.log import READING, Events
-from estimators.track import GATED, HELD_OUT, MISSING, USED, Track
+from estimators.track import ADVISORY, GATED, HELD_OUT, MISSING, USED, Track
 from tests.models import FLOAT_AND_SONAR as MODEL
 
 NAN = np.nan
@@ -60,6 +61,16 @@ def test_sensors_held_out_are_judged_row_by_row(result):
     assert result.held_out["sonar.far"] == (0.5, 0.0, -0.5)
     # The prediction is 3 too low once and 4 too high once.
     assert result.held_out["sonar.near"].bias == 0.5
+
+
+def test_a_row_that_holds_for_long_becomes_degraded_and_then_stale():
+    """One of 100 s, degraded after 5 s and stale after 30 s; the other is the last and holds no time."""
+    t = np.array([0, 100 * 10**9])
+    events = Events(t, t, np.full(2, READING, np.int8), np.zeros(2, np.int32), np.zeros((2, 2)))
+    track = Track.allocate(2, 1, 0, 2)
+    track.health[:] = ADVISORY
+    shares = health_of(events, track, HealthPolicy(degraded_after=5.0, stale_after=30.0))
+    assert (shares["advisory"], shares["degraded"], shares["stale"]) == (0.05, 0.25, 0.7)
 
 
 def test_pictures_of_a_field_weigh_as_many_cells_as_they_knew():
