@@ -209,6 +209,9 @@ class SensorSection(SpreadSection, InstrumentSection):
     rests: Flag = False
     """true switches off the detector of stuck values: the sensor may repeat its value for any time. Default: false, a
     sensor is stuck that repeats its value although the model or other sensors predict movement."""
+    expected: Literal["steadily", "by chance"] = "steadily"
+    """When it reports. by chance: when a landmark, tag or event comes into its view: its silence is no dropout.
+    Default: steadily, or as the model says."""
     duplicates: DuplicatesSection | None = None
     """When a measurement of equal values is a copy, which counts once. Default: if its time is equal too."""
     at: dict[Text, Numbers] | None = None
@@ -274,8 +277,9 @@ class TimeSection(Section):
     expected latency. Default: 2."""
     degraded_after: Seconds | None = None
     """Seconds without a used measurement after which health is degraded. Default: the slowest time constant
-    of the model at the prior, but at least 3 s and three periods of the slowest sensor (simulated, or at the begin of
-    a recording), and at most stale_after if that is given; `nisus fold` prints where it comes from."""
+    of the model at the prior, but at least 3 s and three periods of the slowest sensor (simulated, or the longest that
+    a recording keeps four times in succession), and at most stale_after if that is given; `nisus fold` prints where it
+    comes from."""
     stale_after: Seconds = 15.0
     """Seconds without a used measurement after which health is stale; not below degraded_after. Default: 15, or four
     times a degraded_after that follows from a longer period."""

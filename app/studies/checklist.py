@@ -131,10 +131,12 @@ def _timing(checked: Checked) -> Answer:
     horizon, policy = checked.twin.config.time.horizon, checked.twin.policy
     reporting = [item for item in checked.arrivals if item.n]
     late = [item.lateness[-1] for item in reporting if np.isfinite(item.lateness[-1])]
-    absent = [item.sensor for item in checked.arrivals if not item.n]
+    by_chance = {sensor.name for sensor in checked.twin.model.sensors if sensor.by_chance}
+    steady = [item for item in checked.arrivals if item.sensor not in by_chance]
+    absent = [item.sensor for item in steady if not item.n]
     stale, origin = checked.counts["stale"], stamps(checked.twin)
     said = [origin]
-    worst = max(reporting, key=lambda item: np.nan_to_num(item.gap), default=None)
+    worst = max(steady, key=lambda item: np.nan_to_num(item.gap), default=None)
     if worst is not None and np.isfinite(worst.gap):
         said.append(f"longest gap {worst.gap:.3g} s ({worst.sensor})")
     if late:

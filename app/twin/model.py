@@ -372,7 +372,8 @@ def _sensor(sensor: Any, loaded: Loaded) -> Any:
         variances = one_each(loaded, key, section.variances, [row.name for row in sensor.rows])
         rows = tuple(replace(row, variance=variance) for row, variance in zip(sensor.rows, variances, strict=True))
         sensor = replace(sensor, rows=rows)
-    return replace(sensor, limits=limits_of(sensor, section, loaded))
+    by_chance = section.expected == "by chance" or sensor.by_chance and "expected" not in section.model_fields_set
+    return replace(sensor, limits=limits_of(sensor, section, loaded), by_chance=by_chance)
 
 
 def _correlation(sensor: Any, given: Correlation, loaded: Loaded) -> Correlation | None:

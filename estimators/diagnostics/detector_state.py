@@ -83,12 +83,12 @@ def detector_context(
         gate: Probability that a good measurement passes, or None.
         marginal: Whether predictions are not Gaussian, so that `Track.whitened` holds each row by itself.
         baseline: Bias, scale and correlation of the baseline, and the highest W of each test, (rows, 3 + TESTS).
-        expected: Sensors that must report, (sensors,); None for those that have reported.
+        expected: Sensors that must report, (sensors,); None for those that have reported. None that reports by chance.
 
     Returns:
         `baseline` (rows, 3 + TESTS); `normal` (sensors, 3), see `normal_nis`; `ranges` (shown + inputs, 3, 2), in
         which the model was fitted, with `MARGIN` and as far as `FAR`, and physical limits; `fitted`, 1 if there is any;
-        `expected` (sensors,);
+        `expected` (sensors,): 1 for one that must report, -1 by chance, else 0;
         `chances` (2,), log Λ of a rejected and of an accepted measurement; `gated`, whether outliers are rejected;
         `marginal`; `n_tests` in all.
     """
@@ -100,12 +100,13 @@ def detector_context(
         if item.fitted is not None:
             own[:2] = beyond_range(item.fitted), beyond_range(item.fitted, FAR, item.far)
     counts = np.array([len(sensor.rows) for sensor in model.sensors], np.int64)
+    by_chance = [sensor.by_chance for sensor in model.sensors]
     return {
         "baseline": np.ascontiguousarray(baseline, float),
         "normal": normal_nis(model, baseline),
         "ranges": ranges,
         "fitted": int(np.any(np.isfinite(ranges))),
-        "expected": np.zeros(len(counts), np.int64) if expected is None else np.ascontiguousarray(expected, np.int64),
+        "expected": np.where(by_chance, -1, 0 if expected is None else expected).astype(np.int64),
         "chances": gate_log_ratios(gate),
         "gated": int(gate is not None),
         "marginal": int(marginal),

@@ -416,7 +416,7 @@ def weigh_joint(own, nis, dof, h, before):
 
 
 @embedded
-def note_time(own, now, every, tests, policy):
+def note_time(own, now, every, tests, policy, expected):
     """Note the time of a measurement: update the sensor's period, its threshold, and when it will have dropped out."""
     count = own[COUNT]
     if count == 0.0:
@@ -435,7 +435,7 @@ def note_time(own, now, every, tests, policy):
     pause = usual
     if n <= KNOWN_PERIOD:
         pause = max(usual, min(usual * KNOWN_PERIOD / n, policy.stale_after))
-    own[DUE] = now + max(pause, 2.0 * own[LONGEST_GAP]) if n > 2 else np.inf
+    own[DUE] = now + max(pause, 2.0 * own[LONGEST_GAP]) if n > 2 and expected >= 0 else np.inf
     own[SILENT] = 0.0
 
 

@@ -118,7 +118,7 @@ def _test(i, now, y, s, context, policy, state, track):
     first, count = sensor_rows(context, s)
     own = sensor_part(state, s)
     state[SILENT_SENSORS] -= own[SILENT]
-    note_time(own, now, policy.false_alarm_every, context.n_tests, policy)
+    note_time(own, now, policy.false_alarm_every, context.n_tests, policy, ints(context.expected, sensors)[s])
     state[NEXT_DUE] = min(state[NEXT_DUE], own[DUE])
     h = own[THRESHOLD]
     verdict = track.verdict[i]
@@ -239,7 +239,7 @@ def watch_row(i, t, kind, channel, value, context, policy, state, track):
     if not np.isfinite(state[BEGUN]):
         state[BEGUN] = now
         for s in range(sensors):
-            if expected[s] != 0:
+            if expected[s] > 0:
                 sensor_part(state, s)[DUE] = now + policy.stale_after
         state[NEXT_DUE] = now + policy.stale_after
     for k in range(width):

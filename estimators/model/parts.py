@@ -336,7 +336,8 @@ class Sensor:
     NumPy converts to a matrix. R_ij = correlation_ij √(r_i r_j), so the rows' variances are tuned as ever. Of a
     covariance R, give the rows its diagonal and the sensor `correlation_of(R)`.
 
-    `limits` bound what it can measure; measurements beyond are kept in the log and never used.
+    `limits` bound what it can measure; measurements beyond are kept in the log and never used. One that reports
+    `by_chance`, as landmarks come into its view, has no rate and never drops out.
 
     A sensor of many landmarks declares the names and units of their coordinates as its `place`, for example
     (("east", "m"), ("north", "m")). Its h(x, u, p, place, out) also takes the coordinates of the measured landmark;
@@ -351,6 +352,7 @@ class Sensor:
     log_likelihood: Callable | None = None
     correlation: Correlation | None = None
     limits: Limits | None = None
+    by_chance: bool = False
     place: tuple[tuple[str, str], ...] = ()
     family: str = ""
 

@@ -169,7 +169,7 @@ def _of_sensors(model: StateSpaceModel, tuning: Tuning, sensors: Sequence[Sensor
         held = ((STUCK, name, 1.0),)
         yield Mistake(f"{name} stuck", frozenset({"stuck"}), own, fault=_fault("stuck", sensor=name), nudges=held)
         lost = _fault("silence", sensor=name)
-        if len(model.sensors) > 1:
+        if len(model.sensors) > 1 and not sensor.by_chance:
             yield Mistake(f"{name} silent", frozenset({"silent"}), own, fault=lost)
     if len(model.sensors) > 1:
         yield Mistake("all stuck", frozenset({"stuck"}), fault=_fault("stuck"))

@@ -50,6 +50,8 @@ def dropouts(judged: JudgedRows) -> Iterator[FoundEpisode]:
     shared = flags >> (SENSOR_FLAGS - 1) & 1 != 0
     last_sensor = len(model.sensors) if shared.any() else own_bits
     for s in range(last_sensor):
+        if model.sensors[s].by_chance:
+            continue  # it may share its bit with one that dropped out
         heard = events.of_sensor(s)
         earlier = 0 if judged.last_heard is None else int(judged.last_heard[s])
         for run in runs(flags >> s & 1 != 0 if s < own_bits else shared & _in_gap(t, heard)):

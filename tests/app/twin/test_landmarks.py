@@ -142,7 +142,11 @@ def test_there_is_one_entry_for_all_landmarks_of_a_sensor(folder):
 
 
 def test_the_section_of_one_landmark_goes_before_that_of_all(folder):
-    twin = load_twin(folder / "one.yaml", overrides={"sensors.sighting_15": "{variance: [1, 2], use: false}"})
+    own = "{variance: [1, 2], use: false, expected: steadily}"
+    twin = load_twin(
+        folder / "one.yaml", overrides={"sensors.sighting.expected": "by chance", "sensors.sighting_15": own}
+    )
+    assert [sensor.by_chance for sensor in twin.model.sensors] == [True, True, False]
     assert twin.tuning.r.tolist() == pytest.approx([0.04, 0.0009] * 2 + [1.0, 2.0])
     assert twin.tuning.used.tolist() == [True, True, False]
 
