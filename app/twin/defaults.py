@@ -6,6 +6,7 @@ from collections.abc import Callable, Sequence
 from typing import NamedTuple
 
 import numpy as np
+from numpy.lib.stride_tricks import sliding_window_view
 
 from config.schema import ParameterSection, TwinSection, as_width
 from config.source_schema import AssetSection, SimulatorSection
@@ -27,6 +28,8 @@ MIN_DEGRADED_S = 3.0
 MISSED_PERIODS = 3.0
 """Periods of the slowest sensor that must be missed, where they are known."""
 
+KEPT = 4
+"""Intervals in succession that make a rate."""
 
 STALE_RATIO = 4.0
 """Ratio of `stale_after` to a `degraded_after` that is longer than its default, where the YAML gives neither."""
@@ -50,13 +53,13 @@ def degraded_after(
 ) -> DegradedAfter:
     """Return the YAML's value; by default the slowest time constant of the model at its prior, within limits.
 
-    `recorded` returns the period (s) of the slowest sensor in a recording, None if it is not known.
+    `recorded` returns the longest `rhythm` of a sensor in a recording, None if it is not known.
     """
     section = config.time
     if section.degraded_after is not None:
         return DegradedAfter(section.degraded_after, "time.degraded_after")
     slowest = _slowest(model)
-    period = sensor_period(config) or (recorded() if slowest is None else None)  # it may take seconds
+    period = sensor_period(config) or recorded()
     least = MIN_DEGRADED_S if period is None else max(MIN_DEGRADED_S, MISSED_PERIODS * period)
     if slowest is None:
         reason = "the model has no time constant (nothing in it decays), so "
@@ -73,6 +76,16 @@ def degraded_after(
     if seconds > limit:
         seconds, reason = limit, f"{reason}, and no later than time.stale_after"
     return DegradedAfter(float(seconds), reason)
+
+
+def rhythm(t: np.ndarray) -> float:
+    """Return the longest time between two measurements, at t (ns), that lasts for `KEPT` in succession, s.
+
+    So a logger that changes its rate has the slower one, whereas a pause by itself is none. At least the median.
+    """
+    gaps = np.diff(t)
+    lasting = sliding_window_view(gaps, min(KEPT, gaps.size)).min(axis=1)
+    return float(max(lasting.max(), np.median(gaps))) / 1e9
 
 
 def _slowest(model: StateSpaceModel) -> float | None:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from functools import cached_property
+from functools import cached_property, partial
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -18,6 +18,7 @@ from estimators.log import READING, Events
 from estimators.model.state_space import StateSpaceModel
 
 from .channels import channels, read_faults
+from .defaults import rhythm
 from .sources.asset import SIMULATOR
 from .sources.can import CAN, CAN_LOG, make_player
 from .sources.kind import Kind, Opening, find_databases, find_recording
@@ -33,6 +34,7 @@ if TYPE_CHECKING:
 KEY: Key = ("source",)
 
 FIRST_EVENTS_S = 5.0  # Seconds between two looks for the first frames of a recording
+MOST_EVENTS = 1_000_000  # Events of a table by which its rhythm is known; of a CAN log the first frames are enough
 
 
 @dataclass(frozen=True)
@@ -63,8 +65,9 @@ class Plan:
 
     @cached_property
     def period(self) -> float | None:
-        """Seconds between two measurements of the slowest sensor at the beginning of a recording; None if unknown."""
-        section, slowest = self.loaded.config.source, None
+        """The longest `rhythm` of the sensors of a recording, s, without those by chance unless all are; or None."""
+        section, sensors, slowest = self.loaded.config.source, self.model.sensors, None
+        steady = [k for k in self.fed if not sensors[k].by_chance] or self.fed
         parts = SOURCES[section.type].sections(section, KEY) if self.recorded else {}
         if len(parts) > 1 and self.log_files is not None:
             return None
@@ -74,20 +77,22 @@ class Plan:
                 source = SOURCES[part.type].open(opening)
             except SourceError:
                 return None  # reported when the source is opened to be read
+            most, batches = 1, iter(partial(source.read, FIRST_EVENTS_S), None)
+            if hasattr(source, "as_recorded"):
+                most, batches = MOST_EVENTS, source.as_recorded()
+            read = [Events.empty(self.model.width)]
             try:
-                events = source.first() if hasattr(source, "first") else Events.empty(self.model.width)
-                while events is not None and not len(events):
-                    events = source.read(FIRST_EVENTS_S)
+                while sum(map(len, read)) < most and (batch := next(batches, None)) is not None:
+                    read.append(batch)
             except SourceError:
-                events = None
+                continue
             finally:
                 source.close()
-            if not isinstance(events, Events):
-                continue
-            for sensor in self.fed:
+            events = Events.concat(read, self.model.width)
+            for sensor in steady:
                 t = np.unique(events.t[events.of_sensor(sensor)])
                 if t.size > 2:
-                    slowest = max(slowest or 0.0, float(np.median(np.diff(t))) * 1e-9)
+                    slowest = max(slowest or 0.0, rhythm(t))
         return slowest
 
     def check_files(self) -> None:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import os
 from collections import Counter
-from collections.abc import Generator, Iterable, Sequence
+from collections.abc import Generator, Iterable, Iterator, Sequence
 from pathlib import Path
 
 import numpy as np
@@ -145,9 +145,9 @@ class Table(Recorded):
             return f"{files}: column {name.column!r} is never {wanted} in {self._count} rows, so {fed} has no values"
         return f"{files}: column {name!r} has no value in {self._count} rows, so {fed} has no values"
 
-    def first(self) -> Events | None:
-        """Return the events of the first rows as they were recorded, in place of `read`; None if there are none."""
-        return next((batch for path in self._files for batch in self._one(path) if len(batch)), None)
+    def as_recorded(self) -> Iterator[Events]:
+        """Yield the events of all rows as they were recorded, in place of `read`."""
+        return (batch for path in self._files for batch in self._one(path))
 
 
 def mapped(channels: Sequence[Channel], width: int, report: Report) -> tuple[list[str | TextMatch], ChannelMapping]:

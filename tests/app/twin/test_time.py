@@ -36,10 +36,13 @@ def test_the_yaml_wins(tmp_path):
     assert twin.policy.degraded_after == 4.5 and twin.degraded.reason == "time.degraded_after"
 
 
-@pytest.mark.parametrize(("every", "seconds", "stale"), [(1, 6.0, 15.0), (4, 24.0, 96.0)])
-def test_three_periods_of_the_slowest_sensor_and_no_more_than_stale(tmp_path, every, seconds, stale):
-    """The winding's rate is a random walk: nothing of it decays. A recording is as slow as its first rows."""
-    (tmp_path / "a.csv").write_text("".join(["t,T\n", *(f"{2 * every * k},20\n" for k in range(9))]))
+@pytest.mark.parametrize(
+    ("every", "gaps", "seconds", "stale"),
+    [(1, [2] * 8, 6.0, 15.0), (4, [1] * 50 + [8] * 4 + [1] + [7200] * 3, 24.0, 96.0)],
+)
+def test_three_periods_of_the_slowest_sensor_and_no_more_than_stale(tmp_path, every, gaps, seconds, stale):
+    """The winding's rate is a random walk: nothing of it decays. A rate lasts for four rows; three pauses are none."""
+    (tmp_path / "a.csv").write_text("".join(["t,T\n", *(f"{t},20\n" for t in np.cumsum([0, *gaps]))]))
     table = "{type: table, files: a.csv, time: {column: t}, sensors: {winding: {columns: T}}}"
     for overrides in ({}, {"source": table}):
         policy = load_twin(made(tmp_path, every=every), overrides=overrides).policy
@@ -85,56 +88,42 @@ def test_maintenance_of_the_yaml_is_in_the_fold(tmp_path, capsys):
     assert table.tuning_version.nunique() == 1
 
 
-@pytest.mark.parametrize(
-    ("states", "text"), [("[ratte]", "did you mean rate"), ("[rate, rate]", "names a state twice"), ("[]", "states")]
-)
-def test_maintenance_of_states_that_are_not_there_is_refused_with_its_line(tmp_path, states, text):
-    more = f"maintenance:\n- {{at: 100, what: new fan, states: {states}}}\n"
-    with pytest.raises(ConfigError, match=f"motor.yaml:[67].*{text}"):
-        load_twin(made(tmp_path, more=more))
+def paused(tmp_path, times, after):
+    """A cell whose tester wrote rows at these times, its log, and counts."""
+    (tmp_path / "log.csv").write_text("\n".join(["t,i,v,c", *(f"{t},1.0,3.6,25.0" for t in times)]))
+    path = tmp_path / "cell.yaml"
+    path.write_text(
+        "model: battery_cell\nestimate: {r0: {std: 0.005}}\nprior: {soc: {mean: 0.45, std: 0.2}}\n"
+        f"time: {{paused_after: {after}}}\nsource:\n  {{type: table, files: log.csv, time: {{column: t}}, inputs: "
+        "{current: {columns: i}}, sensors: {voltage: {columns: v}, temperature: {columns: c}}}\n"
+    )
+    twin = load_twin(path)
+    return twin, *read_log(twin, None)
 
 
 def test_inputs_are_unknown_over_a_pause(tmp_path):
     """A logger that was off from 50 to 400 s: what a cell was drained of meanwhile is not in the file."""
-    lines = [f"{k}.0,1.0,3.6,25.0" for k in (*range(51), *range(400, 420))]
-    (tmp_path / "log.csv").write_text("\n".join(["t,i,v,c", *lines]))
-    text = (
-        "model: battery_cell\nestimate: {r0: {std: 0.005}}\nprior: {soc: {mean: 0.45, std: 0.2}}\ntime: {%s}\n"
-        "source:\n  {type: table, files: log.csv, time: {column: t}, inputs: {current: {columns: i}},"
-        " sensors: {voltage: {columns: v}, temperature: {columns: c}}}\n"
-    )
-    at = {}
-    for name, time in (("held", "paused_after: 400"), ("unknown", "paused_after: 60")):
-        path = tmp_path / f"{name}.yaml"
-        path.write_text(text % time)
-        twin = load_twin(path)
-        log, counts = read_log(twin, None)
-        fold = Fold(twin.estimator, twin.model, twin.tuning, log)
-        fold.advance()
-        at[name] = log, fold, counts
-    log, fold, counts = at["unknown"]
+    times = *range(51), *range(400, 420)
+    _, log, counts = paused(tmp_path, times, 400)
+    assert not np.any(log.kind[: log.n] == MAINTENANCE) and counts["paused"] == 0
+    twin, log, counts = paused(tmp_path, times, 60)
+    fold = Fold(twin.estimator, twin.model, twin.tuning, log)
+    fold.advance()
     rows = np.flatnonzero(log.kind[: log.n] == MAINTENANCE)
     assert log.t[rows].tolist() == [400_000_000_000 - 1] * 3
     assert [twin.model.state_names[k] for k in log.channel[rows]] == ["soc", "v1", "temperature"]
     np.testing.assert_allclose(fold.track.std[rows[-1], :3], [0.2, 0.02, 3.0], rtol=1e-12)
     assert fold.track.std[rows[-1], 3] < 0.005
     assert counts["paused"] == 1
-    log, fold, counts = at["held"]
-    assert not np.any(log.kind[: log.n] == MAINTENANCE) and counts["paused"] == 0
 
 
 def test_a_logger_of_one_row_a_minute_does_not_pause_all_the_time(tmp_path):
-    """Rows every 61 s are no pauses of more than 60 s, 400 s after them are one; batches of any size say the same."""
-    times = [*range(0, 1830, 61), 2230, 2291]
-    (tmp_path / "log.csv").write_text("\n".join(["t,i,v,c", *(f"{t},1.0,3.6,25.0" for t in times)]))
-    path = tmp_path / "cell.yaml"
-    path.write_text(
-        "model: battery_cell\nestimate: {r0: {std: 0.005}}\ntime: {paused_after: 60}\nsource:\n  {type: table, files:"
-        " log.csv, time: {column: t}, inputs: {current: {columns: i}}, sensors: {voltage: {columns: v}, temperature:"
-        " {columns: c}}}\n"
-    )
-    twin = load_twin(path)
-    log, counts = read_log(twin, None)
+    """Rows every 61 s are no pauses of more than 60 s, 400 s after them are one; batches of any size say the same.
+
+    Three missing rows make the cell degraded, and twelve stale, though it settles within minutes.
+    """
+    twin, log, counts = paused(tmp_path, [*range(0, 1830, 61), 2230, 2291], 60)
+    assert (twin.policy.degraded_after, twin.policy.stale_after) == (183.0, 732.0)
     rows = np.flatnonzero(log.kind[: log.n] == MAINTENANCE)
     # Of the first row nothing is usual yet.
     assert counts["paused"] == 2 and set(log.t[rows].tolist()) == {61_000_000_000 - 1, 2_230_000_000_000 - 1}
