@@ -23,8 +23,9 @@ from sources.inspect import RecordingContents
 from sources.units import heading_unit
 
 from ...format_time import duration_text
+from ...twin.defaults import rhythm
 from .plan import OMITTED, YAML_NAME, DraftCheck, DraftPlan, Moves, Reads
-from .signals import Signal
+from .signals import Signal, comes_by_chance
 
 _NAME = re.compile(r"[A-Za-z][A-Za-z0-9_-]*")
 MAX_NAME = 100
@@ -287,6 +288,7 @@ def yaml_text(
                 size, time = _number(rounded(reads.error[0])), rounded(reads.error[1])
                 fields += f", error: {{variance: {size}, over: {time:g} s}}"
             fields += ", use: false" if reads.name in drafted.held_out else ""
+            fields += ", expected: by chance" if comes_by_chance(reads.signal, found.t) else ""
             what = "the rate of " if reads.rate else ""
             unit = reads.signal.series.unit or "1"
             sensors.append(f"  {reads.name}: {{{fields}}}  # {_line(unit)}; measures {what}{item.name}")
@@ -295,8 +297,12 @@ def yaml_text(
     first = next((f"[{item.name}, {item.second}]" for item in drafted.states if item.smooth), None)
     if first is None and len(drafted.states) > 1:
         first = f"[{drafted.states[0].name}, {drafted.states[1].name}]"
-    slowest = max(1.0 / reads.signal.rate for reads in read if reads.signal.rate > 0.0)
-    degraded, stale = max(3.0, 5.0 * slowest), max(15.0, 20.0 * slowest)
+    timed = [reads.signal for reads in read if reads.signal.rate > 0.0]
+    slowest = max(1.0 / one.rate for one in timed)
+    steady = [one for one in timed if not comes_by_chance(one, found.t)]
+    longest = max(rhythm(one.series.t) for one in steady or timed)
+    degraded, stale = max(3.0, 5.0 * longest), max(15.0, 20.0 * longest)
+    at_times = f", at times every {longest:.3g} s" * (longest > 2.0 * slowest)
     text = "\n".join
     return f"""\
 # {name}: signals of a recording, each with its own motion. Change it, and {name}.py beside it, into your own twin.
@@ -316,7 +322,7 @@ sensors:  # std: white noise, at least the resolution; error: noise with memory;
 {_estimator(drafted, name)}
 gate: null                       # null uses every measurement; 0.9999 rejects one good measurement in 10,000
 
-time:                            # the slowest sensor reports every {slowest:.3g} s
+time:                            # the slowest sensor reports every {slowest:.3g} s{at_times}
   degraded_after: {degraded:.3g}
   stale_after: {stale:.3g}
   tick: {max(0.5, slowest):.3g}

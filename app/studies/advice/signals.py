@@ -15,6 +15,8 @@ from estimators.errors import LARGEST
 from sources.inspect import RecordingContents, SignalSeries, holes
 from sources.mapping import first_of_hold
 
+from ...twin.defaults import rhythm
+
 MIN_VALUES = 20  # values needed to estimate a noise
 
 SKIPPED = re.compile(
@@ -23,6 +25,8 @@ SKIPPED = re.compile(
 """Names that are not measurements."""
 
 DEGREES = ("deg", "°", "degree", "degrees")
+
+MIN_ABSENCES, MIN_ABSENT = 5, 0.2  # absences, and their share of the time, of a signal that comes by chance
 
 MAX_SWITCH_LEVELS = 8  # levels up to which a signal is a switch and no measurement
 
@@ -117,6 +121,14 @@ def signal(message: str | None, series: SignalSeries) -> Signal:
         wraps,
         unit,
     )
+
+
+def comes_by_chance(one: Signal, recorded: np.ndarray) -> bool:
+    """Return whether a signal is often away for long, beyond its rate, while the recording goes on at `recorded`."""
+    t = one.series.t
+    away, paused = (np.diff(holes(each)).ravel() for each in (t, recorded))
+    away = away[away > 2e9 * rhythm(t)] if away.size else away
+    return away.size >= MIN_ABSENCES + paused.size and bool(away.sum() - paused.sum() > MIN_ABSENT * np.ptp(t))
 
 
 def thinned(one: Signal) -> Signal:

@@ -6,7 +6,7 @@ import pytest
 from app.studies.advice.draft import hint_lines, write_draft
 from app.studies.advice.plan import Roles, plan
 from app.studies.advice.relations import driven, pairs
-from app.studies.advice.signals import noise_of, rough, signal
+from app.studies.advice.signals import comes_by_chance, noise_of, rough, signal
 from app.twin.log_reader import read_log
 from app.twin.twin import load_twin
 from estimators.log import READING
@@ -48,6 +48,15 @@ def test_a_clock_is_no_signal_and_three_times_at_one_interval_are_not_needed():
     walk = SignalSeries("a", "", np.round(pairs * 1e9).astype(np.int64), np.cumsum(rng.normal(0, 1, 300)))
     for smooth in (False, True):
         assert all(0.0 < noise < 1e3 for noise in noise_of(walk, smooth)[1:])
+
+
+def test_a_signal_comes_by_chance_that_is_away_while_others_are_not_and_without_a_rate():
+    """Away for 5 s, twelve times; as the whole recording; once more for long; at a slower rate."""
+    seen, slower = (np.cumsum([*gaps] * 12).astype(int) for gaps in ([1e8] * 40 + [5e9], [1e8] * 40 + [5e9] * 9))
+    always = np.arange(0, slower[-1], 10**8)
+    cases = (seen, always), (seen, seen), (np.delete(seen, slice(50, 300)), seen), (slower, always)
+    found = [comes_by_chance(signal(None, SignalSeries("a", "", t, t % 7.0)), recorded) for t, recorded in cases]
+    assert found == [True, False, False, False]
 
 
 def test_two_sensors_of_one_quantity_are_told_from_two_that_are_alike():
@@ -213,17 +222,21 @@ def test_rows_of_several_sources_are_sensors_that_by_tells_apart(tmp_path, name,
 
 
 def test_files_with_different_columns_become_the_parts_of_a_merged_source(tmp_path):
+    """The receiver is without a fix for 5 s, five times."""
     rng = np.random.default_rng(7)
-    one, other = (np.round(np.cumsum(rng.normal(0, 1, 300)), 3) for _ in range(2))
+    always = np.arange(600) * 0.1
+    seen = np.arange(300) * 0.1 + 5.0 * (np.arange(300) // 50) + 0.03
+    one, other = (np.round(np.cumsum(rng.normal(0, 1, t.size)), 3) for t in (always, seen))
     files = (
-        csv(tmp_path / "odometry.csv", t_s=np.arange(300) * 0.1, speed=one),
-        csv(tmp_path / "gnss.csv", time=np.arange(300) * 0.1 + 0.03, north=other, Fix=np.ones(300)),
+        csv(tmp_path / "odometry.csv", t_s=always, speed=one),
+        csv(tmp_path / "gnss.csv", time=seen, north=other, Fix=np.ones(300)),
     )
     twin, log, _ = drafted(tmp_path, *files)
     assert twin.loaded.config.source.type == "merged"
-    for name, values, shift in (("speed", one, 0.0), ("north", other, 0.03)):
+    assert [sensor.by_chance for sensor in twin.model.sensors] == [False, True]
+    for name, values, times in (("speed", one, always), ("north", other, seen)):
         t, found = of_sensor(log, twin, name)
-        np.testing.assert_allclose(t * 1e-9, np.arange(300) * 0.1 + shift, atol=1e-9)
+        np.testing.assert_allclose(t * 1e-9, times, atol=1e-9)
         assert found.tolist() == values.tolist()
 
 
