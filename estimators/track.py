@@ -42,7 +42,8 @@ class Track(NamedTuple):
 
     mean, std (N, nx): the estimate after the event, in the units of the states. cross (N, pairs): the covariance of
     each configured pair of states. innovation, innovation_std (N, ny): measurement minus prediction and the square
-    root of S's diagonal; NaN for other events. nis: νᵀ S⁻¹ ν, `dof` its degrees of freedom. nis_mean with nis_low and
+    root of S's diagonal; NaN for other events. nis: νᵀ S⁻¹ ν, `dof` its degrees of freedom. log_likelihood: of a
+    rejected measurement always log N(ν; 0, S). nis_mean with nis_low and
     nis_high: mean NIS over the last measurements, and its 95 % bounds. age: seconds since the last measurement that was
     used, gated or failed, or since a reset. consistency: DIVERGED if the window of NIS shows that, else TRACKING.
     whitened (N, ny): the innovation transformed to N(0, I), by row of the measurement; for a prediction that is not

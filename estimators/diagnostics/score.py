@@ -11,6 +11,7 @@ from typing import NamedTuple
 import numpy as np
 from scipy.special import betainc, gammaln
 
+from ..compiled.verdict import LOG_2PI
 from ..log import READING, Events
 from ..model.state_space import StateSpaceModel
 from ..numerics.quantiles import chi_square_quantile, normal_quantile
@@ -36,6 +37,7 @@ from .intervals import scale_interval
 from .references import WITHHELD, held_out_references, true_states
 
 BASELINE_CLIP_SIGMA = 6.0  # σ at which the innovations of a row are clipped in a baseline (episodes/baseline.py)
+MAX_EXACT_NIS = 1e12  # NIS up to which rounding leaves an error of log |S| below 1e-3
 MAX_NIS_FACTOR = (1.0 + LIMITS.width) ** 2  # bands that are wrong by as much as the calibration reports
 
 
@@ -229,7 +231,10 @@ def log_density(refused: Track, gate: float | None) -> np.ndarray:
     # Of t: log Γ((m + 1) / 2) - ½ log π - ½ m log π - ½ log |S| - ½ (m + 1) log(1 + NIS)
     constant = gammaln(0.5 * (m + 1.0)) - 0.5 * (m + 1.0) * np.log(np.pi)
     with np.errstate(all="ignore"):
-        log_scale = np.nansum(np.log(refused.innovation_std), axis=1)
+        # The log-likelihood of a rejected measurement is log N(ν; 0, S) = -½ (NIS + log |S| + m log 2π).
+        log_scale = -refused.log_likelihood - 0.5 * (refused.nis + m * LOG_2PI)
+        diagonal = np.nansum(np.log(refused.innovation_std), axis=1)
+        log_scale = np.where((m > 1.0) & (refused.nis < MAX_EXACT_NIS), log_scale, diagonal)
         cauchy = constant - log_scale - 0.5 * (m + 1.0) * np.log1p(refused.nis)
     # F(m, 1) exceeds g / m with the probability I(1 / (1 + g); ½, m / 2).
     beyond = betainc(0.5, 0.5 * m, 1.0 / (1.0 + chi_square_quantile(gate, m)))

@@ -21,7 +21,7 @@ from ..compiled.noise import independent_rows, semidefinite_root
 from ..estimator import Estimator
 from ..numerics.jit import jit
 from ..numerics.random import ONE, key_of, normal
-from ..track import FAILED, MISSING, USED
+from ..track import FAILED, GATED, MISSING, USED
 from .cloud import DRAW, OPTIONS, RESAMPLE, count_of, describe, own_cloud, own_covariance, score_cloud
 from .draws import reconsider, recover, start
 from .innovation import finite_rows
@@ -100,7 +100,8 @@ def update(context, u, sensor, y, index, state, work, innovation, innovation_std
             keep(context, second, state, work)
             reconsider(context, index, state)
             score_cloud(state, score)
-    score[2] = log_sum if log_sum > -np.inf else np.nan
+    if verdict != GATED:
+        score[2] = log_sum if log_sum > -np.inf else np.nan
     if verdict == FAILED or (verdict == USED and not log_sum > -np.inf):
         verdict = FAILED
         recover(context, index, state)

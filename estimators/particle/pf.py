@@ -43,7 +43,7 @@ from ..numerics.normal_score import add_tails
 from ..numerics.random import fill_normals, key_of
 from ..numerics.simd import added, all_finite, copied, exp_minus, weigh_squares
 from ..numerics.workspace import declare_layout
-from ..track import FAILED, MISSING, USED
+from ..track import FAILED, GATED, MISSING, USED
 from ..tuning import Tuning
 from .cloud import (
     CHUNK,
@@ -326,7 +326,8 @@ def update(context, u, sensor, y, index, state, work, innovation, innovation_std
     state[SETTLED] = settled
     # w_i ← w_i p(y | x_i) / Σ w p(y | x), and log p(y) = log Σ w p(y | x)
     log_sum = normalise(context, state, work)
-    score[2] = log_sum
+    if verdict != GATED:
+        score[2] = log_sum
     if verdict == USED and log_sum > -np.inf:
         drawn = keep_or_resample(context, key_of(context.seed, index, RESAMPLE), log_sum, state, work)
         if drawn and numbers(context)[WIDTH] > 0.0:

@@ -16,7 +16,7 @@ from ..compiled.noise import add_noise, independent_rows, semidefinite_root
 from ..estimator import Estimator
 from ..numerics.jit import inlined, jit
 from ..numerics.random import ONE, key_of, normal
-from ..track import FAILED, MISSING, USED
+from ..track import FAILED, GATED, MISSING, USED
 from .cloud import DRAW, RESAMPLE, count_of, describe, own_cloud, own_covariance, score_cloud
 from .draws import reconsider, recover, start
 from .innovation import finite_rows
@@ -102,7 +102,7 @@ def posterior(m, HL, U, seen, z, P):
 def update(context, u, sensor, y, index, state, work, innovation, innovation_std, score):
     """Draw each particle from its EKF posterior, weigh it, resample where few carry the weight.
 
-    The log-likelihood of a measurement that is not used is that of the particles' Gaussians, Σ w' N(y; h(x), S).
+    The log-likelihood of a held-out measurement is that of the particles' Gaussians, Σ w' N(y; h(x), S).
     """
     if finite_rows(y, sensor_variances(context, sensor).size) == 0:
         return MISSING
@@ -112,7 +112,8 @@ def update(context, u, sensor, y, index, state, work, innovation, innovation_std
         sweep(PROPOSE, context, u, 0.0, sensor, y, key_of(context.seed, index, DRAW), 0.0, state, work)
         add_up(context, work)
     log_sum = normalise(context, state, work)
-    score[2] = log_sum if log_sum > -np.inf else np.nan
+    if verdict != GATED:
+        score[2] = log_sum if log_sum > -np.inf else np.nan
     if verdict == USED and log_sum > -np.inf:
         keep_or_resample(context, key_of(context.seed, index, RESAMPLE), log_sum, state, work)
         reconsider(context, index, state)

@@ -26,7 +26,7 @@ from ..numerics.jit import floats, jit, matrix
 from ..numerics.linalg import copy
 from ..numerics.peaks import peaks_of
 from ..numerics.random import key_of, normal
-from ..track import FAILED, MISSING, USED
+from ..track import FAILED, GATED, MISSING, USED
 from .cloud import (
     MAX_POINTS,
     PROCESS,
@@ -173,12 +173,11 @@ def update(context, u, sensor, y, index, state, work, innovation, innovation_std
     verdict = admit(context, sensor, m, shared.nu, shared.S, shared.U, score)
     score_rows(context, sensor, y, shared, score)
     state[SETTLED] = settled
-    score[2] = np.nan
     if verdict == USED:
         sweep(ADOPT, context, u, 0.0, sensor, y, NO_KEY, 0.0, state, work)
     log_sum = normalise(context, state, work)
-    if log_sum > -np.inf:
-        score[2] = log_sum
+    if verdict != GATED:
+        score[2] = log_sum if log_sum > -np.inf else np.nan
     if verdict == USED and log_sum > -np.inf:
         keep_or_resample(context, key_of(context.seed, index, RESAMPLE), log_sum, state, work)
         reconsider(context, index, state)

@@ -4,8 +4,9 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from scipy.stats import chi2
+from scipy.stats import chi2, f, multivariate_t
 
+from estimators.diagnostics.score import log_density
 from estimators.errors import EstimatorError
 from estimators.fold import Fold, fold
 from estimators.gate.isolation import degrees
@@ -13,6 +14,7 @@ from estimators.log import READING, Events, Log
 from estimators.model.parts import covariance_of
 from estimators.models.lorenz import LORENZ96
 from estimators.registry import ESTIMATORS, checked
+from estimators.track import GATED
 from estimators.tuning import Tuning
 from tests.estimators.linear_models import assert_mean, kalman, random_linear
 from tests.models import level_model
@@ -27,6 +29,7 @@ MODEL = replace(
 )
 Y = np.array([1.3, -0.4, 2.2])
 H, OFFSET, R = MATRICES.H[2], MATRICES.D[2] @ MATRICES.u, covariance_of(C, MATRICES.R[2])
+DENSITIES = [name for name, entry in ESTIMATORS.items() if entry.family != "reference" and not entry.applies(MODEL)]
 THERE = [[0, 1, 2], [0, 2], [1, 2], [2]]
 
 
@@ -59,6 +62,29 @@ def test_ensembles_take_the_whole_r(name, members, there):
     assert run.track.log_likelihood[0] == pytest.approx(log_likelihood, rel=1e-9)
     np.testing.assert_allclose(run.track.innovation_std[0, there], std, rtol=1e-9)
     assert run.track.dof[0] == len(there) == np.isfinite(run.track.innovation[0]).sum()
+
+
+@pytest.mark.parametrize("name", DENSITIES)
+@pytest.mark.parametrize(("there", "factor"), [([0, 1, 2], 30.0), ([0, 2], 30.0), ([2], 30.0), ([0, 1, 2], 1e7)])
+def test_the_density_of_a_rejected_measurement_has_the_whole_s(name, there, factor):
+    """A multivariate Cauchy density of scale S in the tail beyond the gate, whatever the filter.
+
+    S of a filter that draws is a sample covariance of N = 4000: ½ log |S| has a deviation of ½ √(2 m / N), and the term
+    of the NIS one of ½ (m + 1) √(2 / N); four of both. Beyond a NIS of 1e12, the rows count as independent.
+    """
+    drawn = {"ensemble": {"members": 4000}, "particle": {"particles": 4000}}.get(ESTIMATORS[name].family, {})
+    tuning = Tuning.of(MODEL).set("gate", 0.99).with_options(drawn)
+    log = rows_there(there)
+    log.events.value[0, there] *= factor
+    track = fold(name, MODEL, tuning, log)
+    assert track.verdict[0] == GATED
+    S = H[there] @ np.diag(MATRICES.std**2) @ H[there].T + R[np.ix_(there, there)]
+    nu = factor * Y[there] - H[there] @ MATRICES.mean - OFFSET[there]
+    outside = f.sf(chi2.ppf(0.99, len(there)) / len(there), len(there), 1)
+    expected = multivariate_t(df=1, shape=S).logpdf(nu) + np.log(0.01 / outside)
+    if factor > 1e6:
+        expected -= 0.5 * np.log(np.prod(np.diag(S)) / np.linalg.det(S))
+    assert log_density(track, 0.99)[0] == pytest.approx(expected, abs=0.2 if drawn else 1e-6)
 
 
 def test_perturbations_are_correlated():

@@ -2,7 +2,7 @@
 
 import numpy as np
 import pytest
-from scipy.stats import chi2, f, multivariate_t
+from scipy.stats import chi2, f, multivariate_normal, multivariate_t
 
 from estimators.diagnostics.field_pictures import Picture
 from estimators.diagnostics.health import HealthPolicy
@@ -13,11 +13,12 @@ from tests.models import FLOAT_AND_SONAR as MODEL
 
 NAN = np.nan
 GATE = 0.99
+TOGETHER = np.array([[1.0, 7 / 11], [7 / 11, 1.0]])
 # Sensor, verdict, innovations and their deviations, NIS, log-likelihood.
 ROWS = (
     (0, USED, (1.0, NAN), (1.0, NAN), 1.0, -1.5),
     (1, USED, (2.0, 1.0), (1.0, 1.0), 4.0, -2.5),
-    (1, GATED, (9.0, 9.0), (1.0, 1.0), 99.0, -50.0),
+    (1, GATED, (9.0, 9.0), (1.0, 1.0), 99.0, multivariate_normal(cov=TOGETHER).logpdf([9.0, 9.0])),
     (0, MISSING, (NAN, NAN), (NAN, NAN), NAN, NAN),
     (0, MISSING, (NAN, NAN), (NAN, NAN), NAN, NAN),
     (1, HELD_OUT, (3.0, 0.5), (2.0, 0.1), 5.0, -7.0),
@@ -42,9 +43,9 @@ def result():
 def test_the_used_readings_are_summed_and_the_others_counted(result):
     assert (result.readings, result.nis_readings, result.gated, result.missing) == (8, 3, 1, 2)
     assert result.nis == 2.0 and result.log_likelihood_used == -6.0 and result.refused == 0.25
-    # The refused one: 9 and 9 at deviations of 1, of NIS 99 (its rows are correlated), in a Cauchy density's tail.
+    # The refused one: 9 and 9 at deviations of 1, of NIS 162 / (1 + 7 / 11) = 99, in a Cauchy density's tail.
     outside = f.sf(chi2.ppf(GATE, 2) / 2, 2, 1)
-    density = multivariate_t(df=1, shape=np.eye(2)).pdf([np.sqrt(99.0), 0.0]) * (1 - GATE) / outside
+    density = multivariate_t(df=1, shape=TOGETHER).pdf([9.0, 9.0]) * (1 - GATE) / outside
     assert result.log_likelihood == pytest.approx(-6.0 + np.log(density), rel=1e-10)
     # Three readings with 1 + 2 + 2 degrees of freedom.
     assert result.nis_low == pytest.approx(chi2.ppf(0.025, 5) / 3, rel=1e-10)
