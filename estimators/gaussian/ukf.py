@@ -150,6 +150,21 @@ def subtract_opposite(D, m, across):
             across[k, j] -= D[1 + n + k, j]
 
 
+@inlined
+def repair(U, P, scratch):
+    """Add rounding errors of the variances before, of Uᵀ U, to a P that subtraction has left without a factor.
+
+    It stays without one if more than rounding is amiss.
+    """
+    n = P.shape[0]
+    share = EPSILON
+    while not factor(P, scratch) and share <= 4.0 * n * EPSILON:
+        for i in range(n):
+            for k in range(i + 1):
+                P[i, i] += share * U[k, i] * U[k, i]
+        share *= 2.0
+
+
 @by_address
 def update(context, u, sensor, y, index, state, work, innovation, innovation_std, score):
     """x ← x + C S⁻¹ ν;  P ← P - C S⁻¹ Cᵀ, with C and S from fresh sigma points through h.
@@ -179,6 +194,7 @@ def update(context, u, sensor, y, index, state, work, innovation, innovation_std
         move_mean(m, reading.C, reading.chol_S, reading.nu, estimated(context), x)
         wrap_mean(context, x)
         downdate(m, reading.C, reading.chol_S, estimated(context), P, reading.W)
+        repair(own.chol_P, P, own.sigma[: context.nx])
         if is_adaptive(context):
             adapt(context, sensor, y, state, innovation, innovation_std, score)
     return verdict

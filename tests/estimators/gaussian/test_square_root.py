@@ -69,6 +69,17 @@ def test_a_negative_central_weight_is_taken_off(log, values):  # noqa: F811
     same(folded("sr-ukf", PENDULUM, log, values).track, folded("ukf", PENDULUM, log, values).track, 1e-8)
 
 
+@pytest.mark.parametrize("estimator", ["ukf", "ckf"])
+def test_what_rounding_made_indefinite_is_repaired(estimator):
+    """A reading of the variance 1e-14 leaves less of the prior's 900 than its subtraction rounds; P is R ever after."""
+    model = level_model({"y": 1e-14}, 1e-4, std=30.0)
+    track = advanced(estimator, model, log_of(1, *((k, READING, 0.1) for k in range(3)))).track
+    np.testing.assert_array_equal(track.verdict, USED)
+    np.testing.assert_allclose(track.mean, 0.1, rtol=0, atol=1e-7)
+    np.testing.assert_allclose(track.std[1:], 1e-7, rtol=1e-5)
+    assert 1e-7 < track.std[0] < 1e-6
+
+
 def square(x, u, p, dt, out):
     out[0] = 0.5 * x[0] * x[0]
 
