@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from ..compiled.context import sensor_rows, sensor_variances
+from ..compiled.context import prior, sensor_rows, sensor_variances, shown_states
 from ..log import INPUT, READING, RESET
 from ..numerics.jit import borrowed, embedded, floats, inlined, ints, part
 from ..track import (
@@ -80,7 +80,7 @@ from .memory import prior_flags
 from .references import HALF_WIDTH
 
 MIN_PARTICLES = 4.0
-"""Effective sample size below which particles are poor; they also are if all descend from one particle."""
+"""Effective sample size below which particles are poor; they also are if all descend from one particle, or agree."""
 
 POOR_MEASUREMENTS = 60
 """Measurements more, poor than not, from which particles are impoverished; cleared at half as many. Three times the
@@ -173,9 +173,21 @@ def _test(i, now, y, s, context, policy, state, track):
 
 
 @embedded
-def _count_particles(effective, ancestors, state):
+def _agree(std, context):
+    """Return whether all particles have one value of a state that is uncertain, as its prior was; modes may."""
+    _, P = prior(context)
+    shown = shown_states(context)
+    for k in range(std.size):
+        j = shown[k]
+        if not std[k] > 0.0 and P[j % P.shape[0], j] > 0.0 and j != context.mode:
+            return True
+    return False
+
+
+@embedded
+def _count_particles(i, context, state, track):
     """Update whether particles are impoverished after another measurement that was used."""
-    if effective < MIN_PARTICLES or ancestors < 2.0:
+    if track.effective[i] < MIN_PARTICLES or track.ancestors[i] < 2.0 or _agree(track.std[i], context):
         state[POOR] = min(state[POOR] + 1.0, float(POOR_MEASUREMENTS))
     else:
         state[POOR] = max(state[POOR] - 1.0, 0.0)
@@ -254,7 +266,7 @@ def watch_row(i, t, kind, channel, value, context, policy, state, track):
             if not _is_copy(i, track):
                 _test(i, now, y, channel[i], context, policy, state, track)
         if np.isfinite(track.effective[i]):
-            _count_particles(track.effective[i], track.ancestors[i], state)
+            _count_particles(i, context, state, track)
     elif kind[i] == INPUT:
         for k in range(nu):
             if np.isfinite(value[i, k]):

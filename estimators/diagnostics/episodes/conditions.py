@@ -145,7 +145,8 @@ def impoverished_particles(judged: JudgedRows) -> Iterator[FoundEpisode]:
         low, high = (float(np.quantile(effective, share)) for share in (0.025, 0.975))
         size = float(np.median(effective))
         ancestors = float(np.nanmin(track.ancestors[rows]))
-        words = "one particle" if ancestors < 2.0 else f"{ancestors:.0f} particles"
+        same = (track.std[rows] == 0.0) & (np.asarray(judged.model.shown) != judged.model.mode)
+        words = "one particle" if ancestors < 2.0 or same.any() else f"{ancestors:.0f} particles"
         facts = TwinFacts(name="twin", cause="impoverished", start=run.start(t), size=size, ancestors=words)
         yield _found("particles", facts, run.over(t), low, high, run, t)
 

@@ -10,7 +10,7 @@ from scipy.stats import kstest
 from estimators.fold import Fold, fold
 from estimators.log import INPUT, READING
 from estimators.model.state_space import Noise, Row, Sensor, State, StateSpaceModel
-from estimators.particle.cloud import weights_of
+from estimators.particle.cloud import block, weights_of
 from estimators.track import GATED, HELD_OUT, USED
 from estimators.tuning import Tuning
 from tests.estimators.linear_models import ROWS, random_linear
@@ -211,19 +211,26 @@ def test_effective_sample_size_before_resampling():
 
 
 def test_a_poor_cloud_is_told():
-    """A sensor a thousand times sharper than the cloud leaves a particle or two each time; a blunt one does not."""
+    """A sensor a thousand times sharper than the cloud leaves a particle or two each time; a blunt one does not.
+
+    Copies of one particle, which no process noise moves apart, stay so, all of equal weight.
+    """
     from estimators.diagnostics.detector_watch import POOR_MEASUREMENTS
     from estimators.diagnostics.detectors import IMPOVERISHED
     from estimators.diagnostics.episodes import episodes
     from estimators.track import SUSPECT
 
     rng = np.random.default_rng(5)
-    for variance, poor in ((1e-6, True), (0.3, False)):
-        model = scalar(sensors=(Sensor("y", (Row("y", "m", variance),), h=first_state),), f=unchanged)
-        values = 2.0 + np.cumsum(rng.normal(0, np.sqrt(0.3), 100)) + rng.normal(0, np.sqrt(variance), 100)
+    for variance, q, poor in ((1e-6, 0.3, True), (0.3, 0.3, False), (0.3, 0.0, True)):
+        sensors, noises = (Sensor("y", (Row("y", "m", variance),), h=first_state),), (Noise("s", "m²/s", q),)
+        model = scalar(sensors=sensors, noises=noises, f=unchanged)
+        values = 2.0 + np.cumsum(rng.normal(0, np.sqrt(q), 100)) + rng.normal(0, np.sqrt(variance), 100)
         tuning = replace(Tuning.of(model).with_options({"particles": 300}), gate=None)
         log = log_of(1, *((1.0 * k, READING, value) for k, value in enumerate(values)))
-        growing = folded("pf", model, log, tuning)
+        growing = folded("pf", model, log, tuning, stop=1)
+        if q == 0.0:
+            block(growing.options, growing._now.state, 1)[:] = 2.0
+        growing.advance()
         told = np.flatnonzero(growing.track.flags & IMPOVERISHED)
         assert bool(told.size) == poor
         causes = [episode.cause for episode in episodes(growing)]
