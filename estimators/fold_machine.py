@@ -119,6 +119,7 @@ class Machine:
             "n_pairs": len(self._pairs),
             "n_shown": len(model.shown),
             "n_prepared": own["prepared"].size,
+            "n_memory": self.estimator.memory(self.options, model),
             "n_baseline": own["baseline"].size,
             "width": model.width,
             "seed": tuning.seed,

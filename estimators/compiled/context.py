@@ -62,7 +62,7 @@ _FIELDS = """
     log_likelihood n_sensors row_start row_count n_rows circular_x circular_y correlation
     noise_state noise_states max_step
     prior_mean prior_cov prior_rows n_considered linear_states n_linear sampled_states n_sampled jump mode n_modes
-    p q r used gate width options n_options pairs n_pairs shown n_shown prepared n_prepared seed
+    p q r used gate width options n_options pairs n_pairs shown n_shown prepared n_prepared n_memory seed
     baseline n_baseline normal ranges fitted expected chances gated marginal n_tests limits limited duplicates
     memory graded unwatched
 """.split()

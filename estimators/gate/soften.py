@@ -60,8 +60,8 @@ def soften(code, context, u, sensor, y, index, state, work, innovation, innovati
     """Update on a measurement beyond the gate with inflated noise, and return the verdict.
 
     Innovation, standard deviation, NIS and whitened rows in the track stay those of the tuned noise; the log-likelihood
-    is that of the inflated noise. The measurement is rejected where R cannot be inflated, as for a row without noise or
-    a sensor with a density of its own.
+    is that of the inflated noise, and an adaptation does not learn from it. The measurement is rejected where R cannot
+    be inflated, as for a row without noise or a sensor with a density of its own.
     """
     first, rows = sensor_rows(context, sensor)
     r = floats(context.r, context.n_rows)[first : first + rows]
@@ -69,11 +69,15 @@ def soften(code, context, u, sensor, y, index, state, work, innovation, innovati
     if not w < np.inf:
         return GATED
     tuned, nu, std, scored = r.copy(), innovation.copy(), innovation_std.copy(), score.copy()
+    adapted = state[state.size - context.n_memory :]
+    learned = adapted.copy()
     for k in range(rows):
         r[k] *= w
     verdict = call_update(code.update, context, u, sensor, y, index, state, work, innovation, innovation_std, score)
     for k in range(rows):
         r[k] = tuned[k]
+    for k in range(learned.size):
+        adapted[k] = learned[k]
     for k in range(nu.size):
         innovation[k] = nu[k]
         innovation_std[k] = std[k]

@@ -1,5 +1,6 @@
 """Protection of Gaussian filters against a wrong model or wrong measurements: inflation, robust weights, adaptation.
 
+A weight enters the update only: gate, NIS and log-likelihood are those of Gaussian noise R, which a fit maximises too.
 All are off by default, and then cost a comparison. The memory of an adaptation is part of the filter's state, so it is
 rewound and reproduced with it.
 """
@@ -272,7 +273,8 @@ def adapt(context, sensor, y, state, innovation, innovation_std, score):
     values in use stay within the bound. The spread of an adapted r is about S √(2 / (2N - 1)), that of ln s about
     1 / √(N m γ) with γ the share of S that scales with s.
 
-    Correlated rows keep their correlation. An outlier counts fully: use the gate. Sources: Mohamed & Schwarz (1999),
+    Correlated rows keep their correlation. An outlier counts fully: use the gate; softened
+    measurements do not count. Sources: Mohamed & Schwarz (1999),
     doi:10.1007/s001900050236, for R (there over a window); Bar-Shalom, Li & Kirubarajan (2001), 11.2, for the level of
     Q.
     """
