@@ -2,7 +2,9 @@
 
 At each state the variance of a row is divided by the taper of its distance, so that far rows count less, and rows
 beyond the radius not at all. On a circle the distance is the short way round. States are independent of each other; all
-threads share them.
+threads share them. With a variance for each state there is no one S: NIS, gate and likelihood are those of the forecast
+covariance between the rows, tapered by their distance, as in `enkf` (analysis.py). They judge the forecast, not the
+weight that the analysis gives to a measurement.
 
 Source: Hunt, Kostelich & Szunyogh (2007), doi:10.1016/j.physd.2006.11.008, with their smooth localisation: R⁻¹ times a
 factor that falls with the distance. Their inflation is of the forecast; here, as in all ensemble filters, it is of the

@@ -1,6 +1,7 @@
-"""The iterated extended Kalman filter: the update is linearised again at its own result until that converges.
+"""The iterated extended Kalman filter: the update is linearised again at its own result.
 
-It is the Gauss-Newton minimum of ½ |x - x̂|²_P⁻¹ + ½ |y - h(x)|²_R⁻¹. The update is that of ekf.py with `iterations`.
+Each iteration is a Gauss-Newton step to the minimum of ½ |x - x̂|²_P⁻¹ + ½ |y - h(x)|²_R⁻¹. The update is that of ekf.py
+with `iterations`; that they suffice is not tested.
 
 Source: Bell & Cathey (1993), doi:10.1109/9.250476.
 """

@@ -6,9 +6,10 @@ With w = x' - f(x) of each step between events and all moments those of the smoo
     qⱼ ← qⱼ Σ tr(Q⁻¹ Sⱼ Q⁻¹ E[w wᵀ]) / Σ tr(Q⁻¹ Sⱼ),    Q = Σ qⱼ Sⱼ
     r ← mean of (y - h(x))² + H P Hᵀ
 
-For a linear model each round raises the likelihood of the measurements until it reaches a maximum. Convergence is slow
-where one noise masks another, so each pair of rounds is extrapolated. EM reaches the same maximum likelihood estimate
-as a direct search.
+For a linear model whose Sⱼ do not overlap (Sⱼ Q⁻¹ Sₖ = 0) each round raises the likelihood of the measurements until it
+reaches a maximum; with Sⱼ that do, the maximum is a fixed point, but a round may lower the likelihood. Convergence is
+slow where one noise masks another, so each pair of rounds is extrapolated. EM reaches the same maximum likelihood
+estimate as a direct search.
 
 Sources: Shumway & Stoffer (1982), doi:10.1111/j.1467-9892.1982.tb00349.x; Särkkä, Bayesian Filtering and Smoothing
 (2013), 12.3.
