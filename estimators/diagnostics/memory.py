@@ -27,7 +27,7 @@ from ..compiled.jacobians import scratch_size, state_jacobian
 from ..estimator import Estimator
 from ..model.state_space import StateSpaceModel
 from ..numerics.jit import inlined, part, plain
-from ..numerics.linalg import congruence, copy, wrap
+from ..numerics.linalg import congruence, copy, copy_vector, multiply, wrap
 from ..numerics.workspace import declare_layout, size_of, view
 from .detectors import MEMORY_AT, MEMORY_FLAGS, memory_flag
 
@@ -102,8 +102,7 @@ def _clear(time):
 def _copy(time, other):
     copy(time.D, other.D)
     copy(time.Phi, other.Phi)
-    for i in range(time.d.size):
-        other.d[i] = time.d[i]
+    copy_vector(time.d, other.d)
 
 
 @part
@@ -111,20 +110,14 @@ def _carry(F, rows, time, products):
     """Φ ← F Φ, d ← F d, D ← F D Fᵀ, where F is the identity beyond its first `rows`."""
     n = F.shape[0]
     congruence(F, rows, time.D, products)
+    multiply(F, rows, time.Phi, products)
+    copy(products[:rows], time.Phi)
     moved = products[n]
     for i in range(rows):
         moved[i] = 0.0
-        for j in range(n):
-            products[i, j] = 0.0
         for k in range(n):
-            a = F[i, k]
-            if a != 0.0:
-                moved[i] += a * time.d[k]
-                for j in range(n):
-                    products[i, j] += a * time.Phi[k, j]
-    copy(products[:rows], time.Phi)
-    for i in range(rows):
-        time.d[i] = moved[i]
+            moved[i] += F[i, k] * time.d[k]
+    copy_vector(moved[:rows], time.d)
 
 
 @part
@@ -166,8 +159,7 @@ def _spread(kind, n, state, P):
 def before_update(context, at, state):
     """Keep the prediction."""
     own = memory_of(at, context.nx)
-    for i in range(context.nx):
-        own.x[i] = state[i]
+    copy_vector(state[: context.nx], own.x)
     _spread(context.memory, context.nx, state, own.P)
 
 
@@ -200,19 +192,25 @@ def memory_flags(at, n):
 @part
 def prior_flags(context, at):
     """Return the bits of `Track.flags` of the states of whose variance measurements have not yet taken half."""
-    n, bits = context.nx, 0
-    own, shown = memory_of(at, n), shown_states(context)
+    bits, own, shown = 0, memory_of(at, context.nx), shown_states(context)
     for s in range(min(shown.size, MEMORY_FLAGS)):
-        j = shown[s]
-        rho = own.P[j, j] / (own.P[j, j] + own.now.D[j, j])
-        for k in range(LEVELS):
-            level = level_of(own.end + 8 * k * level_words(n), n)
-            # 0 until two of its times have ended.
-            if level.rho[j] > 0.0:
-                rho = min(rho, level.rho[j])
-        if context.graded >> s & 1 != 0 and rho > 0.5:
+        if context.graded >> s & 1 != 0 and _judged(own, context.nx, shown[s])[1] > 0.5:
             bits |= 1 << s
     return bits << MEMORY_AT
+
+
+@inlined
+def _judged(own, n, j):
+    """Return the largest W of state j over the times that are its memory, and the smallest ρ of all times."""
+    most, least = 0.0, own.P[j, j] / (own.P[j, j] + own.now.D[j, j])
+    for k in range(LEVELS):
+        level = level_of(own.end + 8 * k * level_words(n), n)
+        rho = level.rho[j]
+        if rho > 0.0:  # 0 until two times of the level have ended
+            least = min(least, rho)
+            if LOW < rho < HIGH:
+                most = max(most, level.W[j])
+    return most, least
 
 
 @part
@@ -271,16 +269,9 @@ def _weigh(time, P, estimated, level):
 @inlined
 def _in_alarm(context, own, before):
     """Return the bits of the shown states whose corrections are too large over their memory."""
-    n, bits = context.nx, 0
-    shown = shown_states(context)
+    bits, shown = 0, shown_states(context)
     for s in range(min(shown.size, MEMORY_FLAGS)):
-        if context.graded >> s & 1 == 0:
-            continue
-        j, most = shown[s], 0.0
-        for k in range(LEVELS):
-            level = level_of(own.end + 8 * k * level_words(n), n)
-            if level.kept[0] != 0.0 and level.rho[j] > LOW and level.rho[j] < HIGH:
-                most = max(most, level.W[j])
-        if most >= (0.5 * BEYOND if before >> s & 1 else BEYOND):
+        beyond = 0.5 * BEYOND if before >> s & 1 else BEYOND
+        if context.graded >> s & 1 != 0 and _judged(own, context.nx, shown[s])[0] >= beyond:
             bits |= 1 << s
     return bits

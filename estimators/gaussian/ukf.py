@@ -20,6 +20,7 @@ from ..compiled.context import (
     expect_points,
     options,
     row_count,
+    sensor_variances,
     transition_points,
 )
 from ..estimator import POINTS, Estimator, Option, Options, SmoothingRule
@@ -150,6 +151,9 @@ def subtract_opposite(D, m, across):
             across[k, j] -= D[1 + n + k, j]
 
 
+SHARP = 1e-8  # R over S below which rounding can leave P without a factor
+
+
 @inlined
 def repair(U, P, scratch):
     """Add rounding errors of the variances before, of Uᵀ U, to a P that subtraction has left without a factor.
@@ -194,7 +198,11 @@ def update(context, u, sensor, y, index, state, work, innovation, innovation_std
         move_mean(m, reading.C, reading.chol_S, reading.nu, estimated(context), x)
         wrap_mean(context, x)
         downdate(m, reading.C, reading.chol_S, estimated(context), P, reading.W)
-        repair(own.chol_P, P, own.sigma[: context.nx])
+        sharp, r = False, sensor_variances(context, sensor)
+        for k in range(r.size):
+            sharp |= r[k] < SHARP * innovation_std[k] * innovation_std[k]
+        if sharp:
+            repair(own.chol_P, P, own.sigma[: context.nx])
         if is_adaptive(context):
             adapt(context, sensor, y, state, innovation, innovation_std, score)
     return verdict
