@@ -116,31 +116,11 @@ def fold_event(
                 before_update(context, memory, state)
             if left:
                 verdict = call_update(
-                    code.update,
-                    context,
-                    u,
-                    sensor,
-                    given,
-                    index,
-                    state,
-                    work,
-                    innovation[i],
-                    innovation_std[i],
-                    score,
+                    code.update, context, u, sensor, given, index, state, work, innovation[i], innovation_std[i], score
                 )
             if verdict == GATED and rule.soft != 0:
                 verdict = soften(
-                    code,
-                    context,
-                    u,
-                    sensor,
-                    given,
-                    index,
-                    state,
-                    work,
-                    innovation[i],
-                    innovation_std[i],
-                    score,
+                    code, context, u, sensor, given, index, state, work, innovation[i], innovation_std[i], score
                 )
             if variances:
                 for k in range(rows):

@@ -70,11 +70,7 @@ def no_baseline(model: StateSpaceModel) -> np.ndarray:
 
 
 def detector_context(
-    model: StateSpaceModel,
-    gate: float | None,
-    marginal: bool,
-    baseline: np.ndarray,
-    expected: np.ndarray | None = None,
+    model: StateSpaceModel, gate: float | None, marginal: bool, baseline: np.ndarray, expected: np.ndarray | None = None
 ) -> dict[str, Any]:
     """Return the detectors' entries of a filter's context.
 

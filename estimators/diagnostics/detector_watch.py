@@ -239,10 +239,7 @@ def _health(i, now, silent, flags, state, policy, track):
 
 @embedded
 def watch_row(i, t, kind, channel, value, context, policy, state, track):
-    """Fill alarms, flags (which hold those of the memory) and health of row i of a track whose other columns are known.
-
-    `state` evolves.
-    """
+    """Fill alarms, flags (beside those of the memory) and health of row i of a track; `state` evolves."""
     sensors, rows, nu = context.n_sensors, context.n_rows, context.nu
     width = track.alarms.shape[1]
     expected = ints(context.expected, sensors)

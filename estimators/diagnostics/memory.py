@@ -169,15 +169,13 @@ def after_update(context, at, state):
     n = context.nx
     own, circular = memory_of(at, n), circular_states(context)
     now = own.now
+    copy(own.P, own.F)
+    _spread(context.memory, n, state, own.P)
     for i in range(n):
         moved = state[i] - own.x[i]
         now.d[i] += wrap(moved) if circular[i] != 0 else moved
         for j in range(n):
-            now.D[i, j] += own.P[i, j]
-    _spread(context.memory, n, state, own.P)
-    for i in range(n):
-        for j in range(n):
-            now.D[i, j] -= own.P[i, j]
+            now.D[i, j] += own.F[i, j] - own.P[i, j]
     own.count[0] += 1.0
     if own.count[0] >= FIRST:
         _end_time(context, at, own)

@@ -61,10 +61,7 @@ HALF_WIDTH = 1.959963984540054  # Half-width of a 95 % band, in standard deviati
 
 
 def withheld(model: StateSpaceModel, track: Track) -> np.ndarray:
-    """Return where the estimate of a shown state is withheld, (n, shown).
-
-    Its 95 % band is wider than its limit, or the model is far outside the range in which it was fitted.
-    """
+    """Return where a shown state is withheld, (n, shown): its band exceeds its limit, or the model is far out."""
     limits = np.array([state.withhold for state in model.shown_states])
     far = (track.flags & FAR_OUTSIDE != 0)[:, np.newaxis]
     return (track.std > limits / HALF_WIDTH) | far & np.isfinite(limits)
