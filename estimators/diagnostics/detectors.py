@@ -278,7 +278,7 @@ DETECTORS = (
     Detector(
         "corrected",
         "{0.name} is corrected {0.since} by more than its band allows, over the time in which it forgets",
-        "the model or an input is wrong for it, which may lie outside its band; `nisus check` compares them",
+        "its true value may lie outside the band, as the model or an input is wrong; `nisus check` compares them",
         statistic="sum of corrections that leave 20 to 90 % of the variance of a forecast, tested at variance 2.5",
         effect="the value",
     ),
