@@ -27,11 +27,9 @@ from .health import HealthPolicy, normal_nis
 # Twin: rows in alarm, of which the bands are valid and wider than necessary; rows lost; time at which the next sensor
 # drops out; time of the first event, whether a measurement has arrived; sensors that dropped out; measurements more,
 # poor than not, of a particle filter, and whether it is impoverished; measurements until divergence is judged after a
-# reset; if the first measurement of a sensor contradicts the prior, the flags of the states that it still determines,
-# at first all.
-SUSPECT_ROWS, ADVISED_ROWS, LOST_ROWS, NEXT_DUE, BEGUN, HEARD, SILENT_SENSORS, POOR, POOR_CLOUD = range(9)
-UNSETTLED, CONTRADICTED = 9, 10
-TWIN = 11
+# reset.
+SUSPECT_ROWS, ADVISED_ROWS, LOST_ROWS, NEXT_DUE, BEGUN, HEARD, SILENT_SENSORS, POOR, POOR_CLOUD, UNSETTLED = range(10)
+TWIN = 10
 
 # Sensor: W of the joint tests, then the number of measurements, time of the first and the last, longest gap, threshold
 # of the tests, time at which it drops out, whether it has, alarms of the joint tests.
@@ -218,5 +216,4 @@ def forget(state, sensors, rows, window):
         own[RESETTING] = float(window) if before > 0.0 else 0.0
         own[RAW] = own[WHITE] = own[LEFT] = np.nan
     state[SUSPECT_ROWS] = state[ADVISED_ROWS] = state[LOST_ROWS] = state[POOR] = state[POOR_CLOUD] = 0.0
-    state[CONTRADICTED] = 0.0
     state[UNSETTLED] = float(window)

@@ -27,8 +27,6 @@ from .detector_state import (
     ADVISED,
     ADVISED_ROWS,
     BEGUN,
-    CONTRADICTED,
-    COUNT,
     DUE,
     GRADE,
     HEARD,
@@ -76,7 +74,6 @@ from .detectors import (
     STUCK,
     TESTS,
 )
-from .memory import prior_flags
 from .references import HALF_WIDTH
 
 MIN_PARTICLES = 4.0
@@ -85,9 +82,6 @@ MIN_PARTICLES = 4.0
 POOR_MEASUREMENTS = 60
 """Measurements more, poor than not, from which particles are impoverished; cleared at half as many. Three times the
 number between two counts of ancestors: by chance one count may be 1, hardly three in succession."""
-
-
-FIRST_SIGMA = 5.0  # |e| of a sensor's first measurement that contradicts the prior
 
 
 @inlined
@@ -158,8 +152,6 @@ def _test(i, now, y, s, context, policy, state, track):
                 e = innovation / std
             if np.isfinite(e):
                 note_coverage(each, e, own)
-                if own[COUNT] == 1.0 and abs(e) > FIRST_SIGMA:
-                    state[CONTRADICTED] = -1.0
                 mask = mask & LOST | weigh(each, e, h, base, before)
         if k == 0:
             mask = mask & ~(DISAGREEING | AGREEING) | int(own[JOINT_MASK])
@@ -277,10 +269,6 @@ def watch_row(i, t, kind, channel, value, context, policy, state, track):
         if sensor_part(state, s)[SILENT] != 0.0:
             flags |= 1 << min(s, SENSOR_FLAGS - 1)
     silent = flags & SENSOR_MASK
-    if state[CONTRADICTED] != 0.0 and context.memory != 0:
-        left = int(state[CONTRADICTED]) & prior_flags(context, u.ctypes.data + 8 * nu)
-        state[CONTRADICTED] = float(left)
-        flags |= left
     if context.fitted != 0:
         flags |= _range(i, u, context, track)
     if state[POOR_CLOUD] != 0.0:

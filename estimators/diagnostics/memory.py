@@ -187,28 +187,15 @@ def memory_flags(at, n):
     return int(memory_of(at, n).count[1]) << MEMORY_AT
 
 
-@part
-def prior_flags(context, at):
-    """Return the bits of `Track.flags` of the states of whose variance measurements have not yet taken half."""
-    bits, own, shown = 0, memory_of(at, context.nx), shown_states(context)
-    for s in range(min(shown.size, MEMORY_FLAGS)):
-        if context.graded >> s & 1 != 0 and _judged(own, context.nx, shown[s])[1] > 0.5:
-            bits |= 1 << s
-    return bits << MEMORY_AT
-
-
 @inlined
 def _judged(own, n, j):
-    """Return the largest W of state j over the times that are its memory, and the smallest ρ of all times."""
-    most, least = 0.0, own.P[j, j] / (own.P[j, j] + own.now.D[j, j])
+    """Return the largest W of state j over the times that are its memory."""
+    most = 0.0
     for k in range(LEVELS):
         level = level_of(own.end + 8 * k * level_words(n), n)
-        rho = level.rho[j]
-        if rho > 0.0:  # 0 until two times of the level have ended
-            least = min(least, rho)
-            if LOW < rho < HIGH:
-                most = max(most, level.W[j])
-    return most, least
+        if LOW < level.rho[j] < HIGH:  # ρ is 0 until two times of the level have ended
+            most = max(most, level.W[j])
+    return most
 
 
 @part
@@ -270,6 +257,6 @@ def _in_alarm(context, own, before):
     bits, shown = 0, shown_states(context)
     for s in range(min(shown.size, MEMORY_FLAGS)):
         beyond = 0.5 * BEYOND if before >> s & 1 else BEYOND
-        if context.graded >> s & 1 != 0 and _judged(own, context.nx, shown[s])[0] >= beyond:
+        if context.graded >> s & 1 != 0 and _judged(own, context.nx, shown[s]) >= beyond:
             bits |= 1 << s
     return bits

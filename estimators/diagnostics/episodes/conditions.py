@@ -93,9 +93,8 @@ def left_ranges(judged: JudgedRows) -> Iterator[FoundEpisode]:
         if state.limits is not None:
             low, high = state.limits
             yield from _beyond(state, "impossible", (mean + half < low) | (mean - half > high), mean, t, state.limits)
-        for found in _beyond(state, "corrected", track.flags & memory_flag(column) != 0, mean, t):
-            grade = found.episode.grade if state.watched else "advisory"
-            yield found._replace(episode=found.episode._replace(grade=grade))
+        if state.watched:
+            yield from _beyond(state, "corrected", track.flags & memory_flag(column) != 0, mean, t)
     rows = np.flatnonzero(events.kind == INPUT)
     for j, item in enumerate(model.inputs):
         value = events.value[rows, j]

@@ -119,16 +119,6 @@ def test_a_steady_error_that_no_sensor_shows_is_told_of_the_state_that_it_moves(
     assert not unwatched.any()
 
 
-def test_a_prior_that_the_first_measurement_contradicts_is_told_of_what_it_still_determines():
-    """Until measurements have halved the variance of a forecast from the start, of a dense filter."""
-    log, _ = cell(1.0, 400)
-    far = replace(CELL, states=(replace(CELL.states[0], mean=1.2), CELL.states[1]))
-    track = folded("kf", far, log, policy=QUIET).track
-    left = [by_forecasts(log, 0, end)[1] for end in range(2, 401)]
-    own = (track.flags[3::2, None] & [memory_flag(0), memory_flag(1)]) != 0
-    np.testing.assert_array_equal(own, np.minimum.accumulate(np.array(left) > 0.5))
-
-
 def test_a_reset_begins_again():
     log, _ = cell(0.9, 4000)
     log.extend(log_of(CELL.width, (4000, RESET, 0.0)).events)

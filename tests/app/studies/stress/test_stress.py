@@ -264,7 +264,7 @@ def test_a_grade_worse_than_without_the_mistake_is_counted_for_it():
 
 
 def test_a_wrong_belief_over_a_recording_is_foretold_by_what_follows(data):
-    """Begun anew every 300 s of it: a hundred times R is found each time, a tenth of Q hardly ever."""
+    """Begun anew every 300 s of it: a tenth of R is found each time, a tenth of Q hardly ever."""
     data("battery_panasonic_18650pf", "25degC_US06.mat")
     # Without the errors that last, and with what was normal then.
     overrides = {
@@ -281,5 +281,5 @@ def test_a_wrong_belief_over_a_recording_is_foretold_by_what_follows(data):
     }
     twin = load_twin("battery_panasonic", overrides=overrides)
     bench, oracle = Bench(twin, 0, 300.0), Oracle(twin, 300.0)
-    told = {name: oracle.foretell(bench, chosen(bench, name), "ekf").verdict for name in ("R x100", "Q /10")}
-    assert told == {"R x100": VISIBLE, "Q /10": INVISIBLE}
+    told = {name: oracle.foretell(bench, chosen(bench, name), "ekf").verdict for name in ("R /10", "Q /10")}
+    assert told == {"R /10": VISIBLE, "Q /10": INVISIBLE}
