@@ -32,7 +32,7 @@ from ..numerics.workspace import declare_layout, size_of, view
 from .detectors import MEMORY_AT, MEMORY_FLAGS, memory_flag
 
 FIRST, LEVELS = 16, 16  # Measurements of a time of the first level, and the levels: half a million measurements
-MOST = 32  # States of a model whose memory is followed
+MAX_STATES = 32  # States of a model whose memory is followed
 LOW, HIGH = 0.2, 0.9  # ρ of the times that are a state's memory
 VARIANCE = 2.5  # Of z, that the tests look for
 MAX_Z = 6.0  # |z| is clipped here: a single correction is no proof
@@ -70,7 +70,7 @@ def memory_context(estimator: Estimator, model: StateSpaceModel, followed: int) 
     `memory` is how the filter's state keeps its spread, `COVARIANCE` or `FACTOR`, or 0 if no memory is `followed`; bits
     of shown states are set in `graded` if their memory is judged, and in `unwatched` if it leaves the twin's health.
     """
-    possible = model.nx <= MOST and not model.black_box and estimator.family == "Gaussian"
+    possible = model.nx <= MAX_STATES and not model.black_box and estimator.family == "Gaussian"
     kind = FACTOR if estimator.name.startswith("sr-") else COVARIANCE
     shown = model.shown_states[:MEMORY_FLAGS]
     return {
@@ -231,7 +231,8 @@ def _weigh(time, P, estimated, level):
     """Add log Λ of a time to the tests of its level; False if a number is not finite.
 
     A considered parameter δ stays in the error, Cov(d, δ) = D_δ, so corrections that it causes follow each other: to
-    the variance of d comes -2 D_δ P_δ / P_δδ, which is exact for times longer than the memory, and bounds shorter ones.
+    the variance of d comes -2 D_δ P_δ / P_δδ, for independent δ and times longer than the memory; for shorter ones
+    it is an approximation. Only what widens the variance is added.
     """
     for j in range(level.W.size):
         D = time.D[j, j]
