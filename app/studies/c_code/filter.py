@@ -207,6 +207,11 @@ class Kalman:
 
     template = "kalman.c"
     covariance = True
+    step_lines: tuple[str, ...] = (
+        "real F[N][N], Q[N][N], f[N];",
+        "transition(filter->x, u, dt, F, Q, f);",
+        "spread(filter->P, F, Q);",
+    )
 
     def __init__(
         self, prefix: str, model: StateSpaceModel, tuning: Tuning, options: Options, formulas: Formulas
@@ -214,16 +219,10 @@ class Kalman:
         self.prefix, self.model, self.tuning, self.options, self.formulas = prefix, model, tuning, options, formulas
         self.rows = max(len(model.sensors[k].rows) for k in formulas.h)
         self.numbers = model.nx + model.nx**2 * self.covariance
-        self.moving = self.prediction()
-        self.updates = {k: self.expectation(k) for k in formulas.h}
-
-    def prediction(self) -> Statements:
-        """Return the formulas of a step."""
-        return self.formulas.statements(F=self.formulas.F, Q=self.formulas.Q, f=self.formulas.f)
-
-    def expectation(self, sensor: int) -> Statements:
-        """Return the formulas of an update."""
-        return self.formulas.statements(h=self.formulas.h[sensor], H=self.formulas.H[sensor])
+        spread = {"F": formulas.F, "Q": formulas.Q} if self.covariance else {}
+        slopes = {k: {"H": H} if self.covariance else {} for k, H in formulas.H.items()}
+        self.moving = formulas.statements(**spread, f=formulas.f)
+        self.updates = {k: formulas.statements(h=h, **slopes[k]) for k, h in formulas.h.items()}
 
     def header(self, title: str) -> str:
         """Return NAME.h."""
@@ -305,32 +304,32 @@ class Kalman:
 
     def step(self) -> list[str]:
         """Return the lines of a step."""
-        lines = ["real F[N][N], Q[N][N], f[N];", "transition(filter->x, u, dt, F, Q, f);", "spread(filter->P, F, Q);"]
-        return [*lines, "for (int i = 0; i < N; i++) filter->x[i] = f[i];", *self._wrapped()]
+        return [*self.step_lines, "for (int i = 0; i < N; i++) filter->x[i] = f[i];", *self._wrapped()]
 
     def update(self, k: int, sensor: Sensor) -> list[str]:
         """Return the lines of an update."""
-        rows = len(sensor.rows)
-        estimated = self.model.nx - self.model.considered
         return [
             "const real *x = filter->x;",
-            f"real h[{rows}], H[{rows}][N];",
             *self.tables(k, sensor),
             *self._unused(self.updates[k], "u"),
             *self.updates[k].lines,
-            f"const int verdict = correct(filter->x, filter->P, {estimated}, {rows}, h, H, noise, r, circular, limit,",
-            "                            y, nis, dof);",
+            f"const int verdict = correct(filter->x, {self.gain_of(len(sensor.rows))}, circular, limit, y, nis, dof);",
             *self._wrapped(),
             "return verdict;",
         ]
 
+    def gain_of(self, rows: int) -> str:
+        """Return the arguments of `correct` from which it has the gain."""
+        return f"filter->P, {self.model.nx - self.model.considered}, {rows}, h, H, noise, r"
+
     def tables(self, k: int, sensor: Sensor) -> list[str]:
-        """Return the constants of a sensor: its noise, which rows are angles, and the limits of its gate."""
+        """Return the variables of an update and the constants of a sensor: noise, rows that are angles, gate."""
         rows = len(sensor.rows)
         limits = np.full(rows + 1, np.inf)
         if self.tuning.gate is not None:
             limits[1:] = chi_square_quantile(self.tuning.gate, np.arange(1, rows + 1))
         return [
+            f"real h[{rows}]{f', H[{rows}][N]' * self.covariance};",
             _table(f"noise[{rows * rows}]", self.noise(k, sensor).ravel()),
             f"static const int circular[{rows}] = {{{', '.join(str(int(row.circular)) for row in sensor.rows)}}};",
             _table(f"limit[{rows + 1}]", limits),
@@ -361,17 +360,9 @@ class Kalman:
         """Return the cycles of a step and of the longest update, estimated."""
         n, m = self.model.nx, self.rows
         update = max(_cycles(item.operations) for item in self.updates.values())
-        return _cycles(self.moving.operations) + self.step_cycles(n), update + self.update_cycles(n, m)
-
-    @staticmethod
-    def step_cycles(n: int) -> int:
-        """Return the cycles of F P Fᵀ."""
-        return 4 * n**3
-
-    @staticmethod
-    def update_cycles(n: int, m: int) -> int:
-        """Return the cycles of gain and Joseph form."""
-        return 10 * n * n * m + 4 * n * m * m + 20 * m
+        # F P Fᵀ, gain and Joseph form; or K ν and the NIS alone.
+        more = (4 * n**3, 10 * n * n * m + 4 * n * m * m + 20 * m) if self.covariance else (0, 3 * n * m + 2 * m * m)
+        return _cycles(self.moving.operations) + more[0], update + more[1]
 
 
 class Steady(Kalman):
@@ -379,6 +370,7 @@ class Steady(Kalman):
 
     template = "steady.c"
     covariance = False
+    step_lines = ("real f[N];", "transition(filter->x, u, dt, f);")
 
     def __init__(
         self, prefix: str, model: StateSpaceModel, tuning: Tuning, options: Options, formulas: Formulas
@@ -389,55 +381,24 @@ class Steady(Kalman):
         K, after, before = np.split(found, [n * m, n * m + n * n])
         self.gain, self.after, self.before = K.reshape(n, m), after.reshape(n, n), before.reshape(n, n)
 
-    def prediction(self) -> Statements:
-        """Return the formulas of a step."""
-        return self.formulas.statements(f=self.formulas.f)
-
-    def expectation(self, sensor: int) -> Statements:
-        """Return the formulas of an update."""
-        return self.formulas.statements(h=self.formulas.h[sensor])
-
     def remarks(self) -> list[str]:
         """Return the standard deviations, which are constant."""
         stds = ", ".join(f"{value:.6g}" for value in np.sqrt(np.diag(self.after)))
         return ["", f"/* Standard deviations after a measurement, once the prior is forgotten: {stds}. */"]
 
-    def step(self) -> list[str]:
-        """Return the lines of a step."""
-        lines = ["real f[N];", "transition(filter->x, u, dt, f);"]
-        return [*lines, "for (int i = 0; i < N; i++) filter->x[i] = f[i];", *self._wrapped()]
+    def tables(self, k: int, sensor: Sensor) -> list[str]:
+        """Return them with the gain."""
+        return [*super().tables(k, sensor), _table(f"gain[{self.gain.size}]", self.gain.ravel()), "(void)r;"]
 
-    def update(self, k: int, sensor: Sensor) -> list[str]:
-        """Return the lines of an update."""
-        rows = len(sensor.rows)
-        return [
-            "const real *x = filter->x;",
-            f"real h[{rows}];",
-            *self.tables(k, sensor),
-            _table(f"gain[{self.gain.size}]", self.gain.ravel()),
-            "(void)r;",
-            *self._unused(self.updates[k], "u"),
-            *self.updates[k].lines,
-            f"const int verdict = correct(filter->x, {rows}, h, gain, noise, circular, limit, y, nis, dof);",
-            *self._wrapped(),
-            "return verdict;",
-        ]
+    def gain_of(self, rows: int) -> str:
+        """Return the arguments of `correct` from which it has the gain."""
+        return f"{rows}, h, gain, noise"
 
     def noise(self, k: int, sensor: Sensor) -> np.ndarray:
         """Return S (rows, rows), the covariance of the innovation."""
         u, h = self.model.default_inputs, plain(sensor.h)
         H = kf_steady.columns(lambda x, out: h(x, u, self.tuning.p, out), self.model.nx, len(sensor.rows))
         return H @ self.before @ H.T + super().noise(k, sensor)
-
-    @staticmethod
-    def step_cycles(n: int) -> int:
-        """Return the cycles of the covariance, which is constant."""
-        return 0
-
-    @staticmethod
-    def update_cycles(n: int, m: int) -> int:
-        """Return the cycles of K ν and of the NIS."""
-        return 3 * n * m + 2 * m * m
 
 
 def _vectors(
