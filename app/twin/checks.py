@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Collection, Iterable, Sequence
 from typing import Any
 
 from config.fleet_schema import FleetAlertSection, FleetOutputsSection
@@ -25,15 +25,9 @@ def commissioned(loaded: Loaded, model: StateSpaceModel) -> dict[str, Normal]:
         ConfigError: With file and line, if it names what the model or the bank lacks.
     """
     given = loaded.config.commissioned
+    check_names(loaded, ("commissioned",), given, model.row_names, "sensor row", model)
     for name, section in given.items():
-        if name not in model.row_names:
-            rows = ", ".join(model.row_names[:8])
-            raise loaded.error(("commissioned", name), f"is no sensor row of {model.name}; it has {rows}")
-        for cause in section.reached:
-            if cause not in ALARM_NAMES:
-                raise loaded.error(
-                    ("commissioned", name, "reached", cause), f"is no cause; choose from {', '.join(ALARM_NAMES)}"
-                )
+        check_names(loaded, ("commissioned", name, "reached"), section.reached, ALARM_NAMES, "alarm", model)
     return {
         name: Normal(section.bias, section.scale, section.correlation, section.reached, section.nis, section.forced)
         for name, section in given.items()
@@ -53,24 +47,17 @@ def check_scene(loaded: Loaded, model: StateSpaceModel) -> None:
         check_named(loaded, ("view", "scene", key), names, model)
     rows = {sensor.name: len(sensor.rows) for sensor in model.sensors}
     for key in ("beams", "beacons"):
-        for name in getattr(scene, key):
-            if name not in rows:
-                text = f"names {name!r}, no sensor of {model.name}; {nearest(name, rows)}"
-                raise loaded.error(("view", "scene", key), text)
+        _check_names(loaded, ("view", "scene", key), getattr(scene, key), rows, f"sensor of {model.name}")
     for name, angles in scene.beams.items():
         if len(angles) != rows[name]:
             text = f"has {len(angles)} angles; {name} has {rows[name]} rows, give one for each"
             raise loaded.error(("view", "scene", "beams", name), text)
-    parameters = [parameter.name for parameter in model.parameters]
+    known = (*model.state_names, *(parameter.name for parameter in model.parameters))
     for name, place in scene.beacons.items():
         at = ("view", "scene", "beacons", name)
         if rows[name] != 1:
             raise loaded.error(at, f"is for one distance; {name} has {rows[name]} rows")
-        for item in place:
-            if item not in model.state_names and item not in parameters:
-                near = nearest(item, (*model.state_names, *parameters))
-                text = f"names {item!r}, no state or parameter of {model.name}; {near}"
-                raise loaded.error(at, text)
+        _check_names(loaded, at, place, known, f"state or parameter of {model.name}")
 
 
 def check_stated(loaded: Loaded, model: StateSpaceModel, source: str) -> None:
@@ -123,9 +110,7 @@ def check_named(loaded: Loaded, key: Key, names: Any, model: StateSpaceModel) ->
     Raises:
         ConfigError: With file and line, and the near names.
     """
-    for name in names:
-        if name not in model.state_names:
-            raise loaded.error(key, f"names {name!r}, no state of {model.name}; {nearest(name, model.state_names)}")
+    _check_names(loaded, key, names, model.state_names, f"state of {model.name}")
 
 
 def check_refit(loaded: Loaded, estimator: str, tuning: Tuning) -> None:
@@ -188,8 +173,7 @@ def check_receivers(
             raise loaded.error(("alerts", k), "has no receiver; name one under outputs.receivers")
 
 
-def _check_names(loaded: Loaded, key: Key, given: Sequence[str], known: Sequence[str], kind: str) -> None:
+def _check_names(loaded: Loaded, key: Key, given: Iterable[str], known: Collection[str], kind: str) -> None:
     for name in given:
         if name not in known:
-            near = nearest(name, known) if known else "there is none"
-            raise loaded.error(key, f"names {name!r}, no {kind}; {near}")
+            raise loaded.error(key, f"names {name!r}, no {kind}; {nearest(name, known)}")

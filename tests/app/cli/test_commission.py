@@ -13,7 +13,6 @@ from app.live.tunings.versions import write_section
 from app.studies.commission import lines
 from app.twin.log_reader import read_log
 from app.twin.twin import load_twin
-from estimators.diagnostics.detectors import ALARM_NAMES
 from estimators.diagnostics.episodes.baseline import Normal, baseline_of, lost_from
 from estimators.errors import ConfigError
 from estimators.fold import fold
@@ -124,9 +123,9 @@ def test_a_file_that_cannot_be_written_is_one_line(tmp_path):
     ("section", "said"),
     [
         ("  tooth: {bias: 0, scale: 1, correlation: 0}\n",
-            "drive.yaml:10: commissioned.tooth is no sensor row of motor_winding; it has winding"),
+            "drive.yaml:10: commissioned.tooth is no sensor row of motor_winding; choose from winding"),
         ("  winding:\n    reached:\n      broken: 2\n",
-            "drive.yaml:12: commissioned.winding.reached.broken is no cause; choose from " + ", ".join(ALARM_NAMES)),
+            "drive.yaml:12: commissioned.winding.reached.broken is no alarm of motor_winding; choose from narrow, "),
         ("  winding: {scale: 0}\n", "drive.yaml:10: commissioned.winding.scale"),
         ("  winding: {correlation: 1}\n", "drive.yaml:10: commissioned.winding.correlation"),
     ],
