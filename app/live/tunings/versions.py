@@ -39,8 +39,8 @@ DIGITS = 8
 class Settings:
     """Filter, tuning, scores and evidence of a version.
 
-    `prior` has mean and std by state if it was fitted; `scores` are those of `figures`; `evidence` and
-    `widths` are those of a fit.
+    `prior` is the mean and covariance of a fitted one; `scores` are those of `figures`; `evidence` and `widths` are
+    those of a fit.
     """
 
     estimator: str
@@ -48,7 +48,7 @@ class Settings:
     note: str = ""
     fitted_on: Sequence[str] = ()
     scores: Mapping[str, float] = field(default_factory=dict)
-    prior: Mapping[str, Mapping[str, float]] = field(default_factory=dict)
+    prior: tuple[np.ndarray, np.ndarray] | None = None
     model_version: int = 1
     evidence: EvidenceSection | None = None
     widths: ParameterWidths | None = None
@@ -132,15 +132,10 @@ def version_text(twin: Twin, given: Settings) -> str:
         evidence=given.evidence,
     )
     heading = f"# A tuning version of {twin.name}; `nisus tunings` lists, compares and accepts them.\n"
-    normal = {}
-    if given.tuning.baseline is not None:
-        normal = {
-            name: section.model_dump(mode="json", exclude_unset=True)
-            for name, section in twin.config.commissioned.items()
-        }
-    sections = {"prior": given.prior, "withhold": twin.config.withhold, "commissioned": normal}
-    more = [line for key, section in sections.items() for line in as_section(key, section)]
-    values = tuning_yaml(twin.config, given.estimator, given.tuning, whole=False, widths=given.widths)
+    baseline = {} if given.tuning.baseline is None else twin.config.commissioned
+    normal = {name: section.model_dump(mode="json", exclude_unset=True) for name, section in baseline.items()}
+    more = (*as_section("withhold", twin.config.withhold), *as_section("commissioned", normal))
+    values = tuning_yaml(twin.config, given.estimator, given.tuning, given.prior, whole=False, widths=given.widths)
     return heading + _header(head) + values + "".join(f"{line}\n" for line in more)
 
 
@@ -245,20 +240,13 @@ def widths_of(twin: Twin, found: Fitted) -> ParameterWidths | None:
 def settings_of(twin: Twin, found: Fitted, fitted_on: Sequence[str], note: str = "") -> Settings:
     """Return filter, tuning, widths and held-out scores of a fit of these recordings, with the note of a version."""
     tuning, prior = found.setting
-    beliefs = {}
-    if prior is not None:
-        stds = np.sqrt(np.diag(prior[1]))
-        beliefs = {
-            name: {"mean": float(mean), "std": float(std)}
-            for name, mean, std in zip(tuning.model.state_names, prior[0], stds, strict=True)
-        }
     return Settings(
         found.estimator,
         tuning,
         note,
         tuple(fitted_on),
         _scores(found.after.held_out),
-        beliefs,
+        prior,
         evidence=_evidence(found) if found.proposed else None,
         widths=widths_of(twin, found),
     )

@@ -289,8 +289,8 @@ def test_the_name_is_in_every_row_and_recording(winding, tmp_path):
     text = winding.read_text()
     twin = load_twin(winding)
     tuning = replace(twin.tuning.set("Q.rate", 1e-4))
-    normal = "commissioned:\n  winding: {bias: 0.25}\n"
-    keep(twin, "tried", version_text(twin, Settings("kf", tuning, prior={"rate": {"std": 0.7}})) + normal)
+    settings = Settings("kf", tuning, prior=(twin.model.prior_mean, np.diag([25, 0.49])))
+    keep(twin, "tried", version_text(twin, settings) + "commissioned:\n  winding: {bias: 0.25}\n")
     fold_twin(FoldCommand(str(winding), tuning="tried", out=tmp_path / "a.parquet"))
     assert set(pyarrow.parquet.read_table(tmp_path / "a.parquet").column("tuning").to_pylist()) == {"tried"}
     fold_twin(FoldCommand(str(winding), tuning="tried", out=tmp_path / "a.rrd"))
