@@ -210,7 +210,7 @@ def rows_of(model: StateSpaceModel, names: Sequence[str], at: np.ndarray, events
         "sensor": pa.array([*model.sensor_names, None], pa.string()).take(pa.array(channel)),
     }
     columns |= {f"value_{k}": events.value[:, k] for k in range(model.width)}
-    return pa.table({name: np.ascontiguousarray(c) if isinstance(c, np.ndarray) else c for name, c in columns.items()})
+    return pa.table(columns)
 
 
 class AssetHistory:

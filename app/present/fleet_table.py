@@ -125,7 +125,7 @@ def arrow_table(model: StateSpaceModel, table: FleetTable, order: np.ndarray | N
     columns |= {name: getattr(table, name)[part] for name in names}
     columns["verdict"] = np.array(VERDICT_NAMES)[table.verdict[part]]
     columns |= {"events": table.events[part], "stale": table.stale[part]}
-    return pa.table({name: np.ascontiguousarray(c) if isinstance(c, np.ndarray) else c for name, c in columns.items()})
+    return pa.table(columns)
 
 
 def fleet_topics(model: StateSpaceModel, table: FleetTable, worst: int) -> list[Topic]:

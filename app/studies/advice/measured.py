@@ -237,14 +237,17 @@ def apart_text(sigma: float) -> str:
 
 def bytes_text(count: float) -> str:
     """Return a number of bytes with a prefix."""
-    size, unit = next((step for step in _BYTES if count >= step[0]), _BYTES[-1])
-    return f"{count / size:.3g} {unit}"
+    return _prefixed(count, _BYTES)
 
 
 def seconds_text(seconds: float) -> str:
     """Return a time below minutes with a prefix."""
-    size, unit = next((step for step in _SECONDS if seconds >= step[0]), _SECONDS[-1])
-    return f"{seconds / size:.3g} {unit}"
+    return _prefixed(seconds, _SECONDS)
+
+
+def _prefixed(value: float, steps: Sequence[tuple[float, str]]) -> str:
+    size, unit = next((step for step in steps if value >= step[0]), steps[-1])
+    return f"{value / size:.3g} {unit}"
 
 
 def percent(share: float) -> str:

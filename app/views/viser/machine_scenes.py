@@ -8,6 +8,7 @@ Gripper: the finger and its mirror image, with a pad in the colour of the contac
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from typing import Any
 
 import numpy as np
 import viser
@@ -104,7 +105,7 @@ class GripperScene:
     """Finger on the left and part on the right; x is the way of the finger in mm."""
 
     def __init__(
-        self, api: viser.SceneApi, model: StateSpaceModel, states: Mapping[str, str], palette: Palette
+        self, api: viser.SceneApi, model: StateSpaceModel, states: Mapping[Any, str], palette: Palette
     ) -> None:
         self._surface, self._depth, self._contact = (
             model.state_names.index(states[name]) for name in ("surface", "depth", "contact")
@@ -282,7 +283,7 @@ def mesh(parts: list[Sector]) -> tuple[np.ndarray, np.ndarray]:
 class MotorScene:
     """Motor, and below it the scale of its colours with each part's temperature."""
 
-    def __init__(self, api: viser.SceneApi, model: StateSpaceModel, parts: Mapping[str, str], palette: Palette) -> None:
+    def __init__(self, api: viser.SceneApi, model: StateSpaceModel, parts: Mapping[Any, str], palette: Palette) -> None:
         self._states = [model.state_names.index(name) for name in parts.values()]
         shapes = Shapes(api)
         self.root = shapes.frame()

@@ -120,15 +120,11 @@ class Stage:
         if show == VEHICLE:
             return VehicleScene(api, model, section, self.palette)
         if show == MOTOR:
-            return MotorScene(
-                api, model, {str(part): name for part, name in (section.parts or {}).items()}, self.palette
-            )
+            return MotorScene(api, model, section.parts or {}, self.palette)
         if show == BATTERY:
             return BatteryScene(api, model, section.charge or (), section.temperature, self.palette)
         if show == GRIPPER:
-            return GripperScene(
-                api, model, {str(what): name for what, name in (section.states or {}).items()}, self.palette
-            )
+            return GripperScene(api, model, section.states or {}, self.palette)
         chosen = [values[axis] for axis in AXES if values.get(axis, NO_AXIS) != NO_AXIS]
         return BeliefScene(api, model, [model.state_names.index(name) for name in chosen], self.palette)
 

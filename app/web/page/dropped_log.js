@@ -1,7 +1,7 @@
 // Files dropped on the page: sent in pieces to the folder of recordings, then opened. A recording opens for review; a log
 // opens with its signals, the twins that fit, and a draft of a twin.
 
-import { element, setAttribute, setText } from "./dom.js";
+import { element, setText } from "./dom.js";
 import { clock, compact, count, span, spaced } from "./format.js";
 import { post } from "./session.js";
 
