@@ -217,15 +217,7 @@ def test_a_part_of_a_gate_is_overridden_also_where_the_file_has_a_number(gate, o
     assert (found.probability, found.kind, found.seconds) == expected
 
 
-@pytest.mark.parametrize(
-    ("gate", "rule"),
-    [
-        ("{probability: 2}", "motor.yaml:3: gate.probability is 2; it must be below 1"),
-        ("{kind: soft}", "motor.yaml:3: gate.probability is missing; add it"),
-        ("{probability: 0.9, kind: mild}", "motor.yaml:3: gate.kind is 'mild'; it must be 'hard' or 'soft'"),
-        ("{probability: 0.9, open: 3}", "motor.yaml:3: gate.open is not known"),
-    ],
-)
+@cases(__file__, "refused_gates.csv")
 def test_one_clear_line(gate, rule):
     assert message(TWIN + gate).startswith(rule)
 

@@ -14,6 +14,7 @@ from app.cli.arguments import COMMANDS, NAMES
 from app.cli.main import described, main, parse
 from config.loader import shipped
 from tests import ROOT
+from tests.cases import cases
 
 FULL = Path("/dev/full")
 needs_full = pytest.mark.skipif(not FULL.exists(), reason="there is no /dev/full")
@@ -147,40 +148,21 @@ def documented():
 
 
 WITH_JSON = [name for name, command in NAMES.items() if "json" in command.__dataclass_fields__]
-RUNS = {
-    "twins": "twins",
-    "twins of one": "twins lorenz63",
-    "filters": "filters",
-    "filters of one": "filters --twin lorenz63",
-    "tunings": "tunings lorenz63",
-    "tunings compared": "tunings lorenz63 own own",
-    "fold": "fold lorenz63 --duration 2",
-    "why": "why motor_winding --duration 60",
-    "check": "check motor_winding --duration 60",
-    "advise": "advise motor_winding --duration 60",
-    "compare": "compare lorenz63 --duration 2 --estimators ekf",
-    "stress": "stress motor_winding --only 'winding +2' --seeds 1 --duration 60",
-    "commission": "commission motor_winding --duration 300",
-    "run": "run lorenz63 --headless --duration 0.2",
-    "bus": "bus motor_can --interface virtual --record drive.blf --duration 0.2",
-    "log": "log drive.csv",
-    "advise drafts": "advise drive.csv",
-    "new": "new pump",
-}
+RUNS = Path(__file__).with_name("runs.csv")
 
 
 def test_every_command_with_a_result_prints_json_that_the_guide_describes():
-    assert set(WITH_JSON) == set(documented()) >= {words.split()[0] for words in RUNS.values()}
+    assert set(WITH_JSON) == set(documented()) >= {words.split()[0] for words in RUNS.read_text().splitlines()[1:]}
     without = set(NAMES) - set(WITH_JSON)
     assert without == {"review", "serve", "schema"}  # pages, a JSON Schema
 
 
-@pytest.mark.parametrize("case", RUNS)
-def test_json_is_one_document_of_documented_fields_without_nan(case, nisus, tmp_path, monkeypatch):
+@cases(__file__, "runs.csv")
+def test_json_is_one_document_of_documented_fields_without_nan(words, nisus, tmp_path, monkeypatch):
     fields = documented()
     monkeypatch.chdir(tmp_path)
     (tmp_path / "drive.csv").write_text("t,a,b\n" + "".join(f"{k},{k % 7},{k % 5}\n" for k in range(200)))
-    words = shlex.split(RUNS[case])
+    words = shlex.split(words)
 
     def refuse(constant):
         raise AssertionError(f"{constant} in the JSON of {words}")

@@ -21,17 +21,9 @@ from estimators.track import FAILED, GATED, USED
 from estimators.tuning import Tuning
 from tests import ROOT
 from tests.app.scripted import Replayed, Stepped, pull_all
+from tests.cases import cases
 from tests.support import SECOND
 
-BAD = {
-    "no particles": ("pf", "particles", 0.0, "particles is 0; it must lie between 2 and"),
-    "no members": ("etkf", "members", 0.0, "members is 0; it must lie between 2 and"),
-    "no spread of sigma points": ("ukf", "alpha", 0.0, "alpha is 0; it must lie between"),
-    "a fraction of members": ("etkf", "members", 2.5, "members is 2.5; it must be a whole number"),
-    "a fraction of particles": ("pf", "particles", 99.5, "particles is 99.5; it must be a whole number"),
-    "a radius without positions": ("ensrf", "radius", 5.0, "does not say where its states are; give them positions"),
-    "no such option": ("ekf", "particles", 9.0, "has no option 'particles'"),
-}
 PATH = ROOT / "config" / "twins" / "motor_winding.yaml"
 
 
@@ -44,10 +36,9 @@ def one_line(text, expected):
 
 
 @pytest.mark.parametrize("way", ["yaml", "filters", "set", "api", "page"])
-@pytest.mark.parametrize("case", BAD)
-def test_an_option_that_cannot_be_is_one_line_and_changes_nothing(case, way):
-    name, option, value, expected = BAD[case]
-    place = ""
+@cases(__file__, "bad_options.csv")
+def test_an_option_that_cannot_be_is_one_line_and_changes_nothing(name, option, number, expected, way):
+    value, place = float(number), ""
     stepped = Stepped(of=load_twin("motor_winding", overrides={"estimator": name}))
     stepped.put(reading(stepped.engine.model, 1.0, [40.0]))
     before = stepped.status()

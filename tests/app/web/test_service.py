@@ -5,6 +5,7 @@ import io
 import json
 import os
 import re
+import shlex
 import signal
 import subprocess
 import sys
@@ -18,6 +19,7 @@ from websockets.sync.client import connect
 
 from app.cli.main import main
 from tests import ROOT
+from tests.cases import cases
 from tests.waiting import LIMIT_S, wait_for
 
 TOKENS = {"ann": ("view", "a" * 20), "bob": ("tune", "b" * 20), "plc": ("feed", "c" * 20), "eve": ("admin", "e" * 20)}
@@ -278,20 +280,9 @@ def test_alerts_link_to_the_page_of_the_twin_at_the_service(tmp_path):
         running.stop()
 
 
-@pytest.mark.parametrize(
-    ("arguments", "line"),
-    [
-        ([], "the twins are missing; give YAML files"),
-        (["motor_winding", "motor_winding"], "a twin is called motor_winding already"),
-        ([" .yaml"], "' .yaml': a twin has the name of its file, which is blank; rename it"),
-        (["nothing.yaml"], "there is no such file or bundled twin"),
-        (["motor_winding", "--host", "0.0.0.0"], "--host 0.0.0.0: others can reach it; give --tokens FILE"),
-        (["motor_winding", "--public", "https://a.example"], "others can reach it; give --tokens FILE"),
-        (["motor_winding", "--host", "example.com"], "must be an IP address"),
-    ],
-)
+@cases(__file__, "refused_services.csv")
 def test_a_service_that_cannot_be_is_one_line(capsys, arguments, line, tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     (tmp_path / " .yaml").write_text("model: motor_winding\n")
-    assert main(["serve", *arguments]) == 2
+    assert main(["serve", *shlex.split(arguments)]) == 2
     assert line in capsys.readouterr().err

@@ -1,10 +1,13 @@
 """The lines of an advice: what becomes of a YAML in which they are put."""
 
+import json
+
 import pytest
 
 from app.studies.advice.verdict import Advice, changed, lines, with_entry
 from config.yaml_files import parse, rewrite
 from estimators.errors import ConfigError
+from tests.cases import cases
 
 BEFORE = """\
 # A twin.
@@ -31,25 +34,14 @@ def test_the_section_gives_way_and_nothing_else(end, tmp_path):
     assert "# A twin." in text and "# about the gate" in text and "alpha" not in text
 
 
-@pytest.mark.parametrize(
-    ("before", "after"),
-    [
-        ("noise:   # Q\n  a: {std: 2}  # by hand\n  b: {variance: 3}\ngate: null\n", {"b": {"variance": 3}}),
-        ("noise:\n    # of old\n    a:\n      std: 2\n    b: {variance: 3}\ngate: null\n", {"b": {"variance": 3}}),
-        ("noise:\n  # of b\n  b: {variance: 3}\ngate: null\n", {"b": {"variance": 3}}),
-        ("noise: {a: {std: 2}, b: {variance: 3}}  # Q\ngate: null\n", {"b": {"variance": 3}}),
-        ("noise: {b: {variance: 3}}\ngate: null\n", {"b": {"variance": 3}}),
-        ("noise:\ngate: null\n", {}),
-        ("gate: null\n", {}),
-    ],
-)
+@cases(__file__, "entries.csv")
 def test_an_entry_takes_the_place_of_what_it_says_too(before, after):
     text = with_entry(before, "noise.a", {"variance": 4.0, "over": "3 s"})
     data, _ = parse(text, "x")
     for comment in ("# Q", "# by hand", "# of old", "# of b"):
         assert text.count(comment) == before.count(comment)
     assert "# of b\n" not in before or "# of b\n  b:" in text
-    assert data == {"noise": {"a": {"variance": 4, "over": "3 s"}, **after}, "gate": None}
+    assert data == {"noise": {"a": {"variance": 4, "over": "3 s"}, **json.loads(after)}, "gate": None}
 
 
 def test_what_else_an_entry_says_stays():
