@@ -16,7 +16,7 @@ import numpy as np
 from config.fields import bounds
 from config.loader import Loaded, shown_path
 from config.model_schema import FmuSection, MatricesSection, Model
-from config.schema import ParameterSection, SensorSection, TwinSection
+from config.schema import ParameterSection, PriorSection, SensorSection, TwinSection
 from config.yaml_files import Key, dotted
 from estimators.errors import ConfigError, ModelError, NisusError, nearest
 from estimators.model.assemble import AppendError, JointParameter, assemble
@@ -142,7 +142,8 @@ def configure(model: StateSpaceModel, loaded: Loaded) -> StateSpaceModel:
     states = () if field else model.state_names  # a field may have a million
     places = [*states, *(item.name for item in model.inputs)]
     check_names(loaded, ("valid",), config.valid, places, "state or input", model)
-    check_names(loaded, ("withhold",), config.withhold, states, "state", model)
+    for key in ("withhold", "possible"):
+        check_names(loaded, (key,), getattr(config, key), states, "state", model)
     check_named(loaded, ("watched",), config.watched or (), model)
     own = states[: model.nx - model.considered]
     for name in states[len(own) :]:
@@ -334,18 +335,35 @@ def _states(model: StateSpaceModel, loaded: Loaded) -> Sequence[State]:
         )
     found = []
     for state in states:
-        prior = given.get(state.name)
-        mean, std = (prior.mean, prior.std) if prior else (None, None)
-        found.append(
-            replace(
-                state,
-                mean=state.mean if mean is None else mean,
-                std=state.std if std is None else std,
-                withhold=loaded.config.withhold.get(state.name, state.withhold),
-                watched=state.name in (loaded.config.watched or (state.name,)),
-            )
+        prior = given.get(state.name, PriorSection())
+        state = replace(
+            state,
+            mean=state.mean if prior.mean is None else prior.mean,
+            std=state.std if prior.std is None else prior.std,
+            withhold=loaded.config.withhold.get(state.name, state.withhold),
+            watched=state.name in (loaded.config.watched or (state.name,)),
         )
+        found.append(replace(state, limits=_possible(state, loaded)))
     return _ranged(tuple(found), loaded)
+
+
+POSITIVE = ("K", "kg")
+"""Units of quantities that are not negative. A difference of two may be, and has a prior about 0."""
+
+
+def _possible(state: State, loaded: Loaded) -> tuple[float, float] | None:
+    """Return the physical limits of a state: those of the YAML, else of the model, else of its unit."""
+    given = loaded.config.possible.get(state.name)
+    if given is None:
+        positive = state.unit in POSITIVE and state.mean > 2.0 * state.std
+        return state.limits or ((0.0, inf) if positive else None)
+    low, high = bounds((given.min, given.max))
+    if not low <= state.mean <= high:
+        raise loaded.error(
+            ("possible", state.name),
+            f"is {low:g} to {high:g} {state.unit}, and its prior has the mean {state.mean:g}; change one of them",
+        )
+    return low, high
 
 
 def _ranged(items: Any, loaded: Loaded) -> Any:

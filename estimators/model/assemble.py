@@ -184,7 +184,10 @@ def joint(
         model,
         states=(
             *model.states,
-            *(State(m.name, m.unit, m.value, estimated[m.name].std, appended=True) for m in moved),
+            *(
+                State(m.name, m.unit, m.value, estimated[m.name].std, limits=(m.low, m.high), appended=True)
+                for m in moved
+            ),
             *(State(deviation(m.name), m.unit, 0.0, estimated[m.name].std) for m in considered),
             *(State(outside(m.name), "1", 0.0, 1.0) for m in widened),
         ),

@@ -127,8 +127,23 @@ def forecast_json(model: StateSpaceModel, here: Here, found: Forecast) -> dict[s
     `now` is in seconds of the log, `t` in seconds from then; `states` have mean and the edges of their ± 1σ and ± 2σ
     bands, a probability its mean alone; the mean is null where the state is withheld. `inputs` are those that hold now.
     Of each limit: whether it is looked at from below, the probability of it over the horizon and at each time, and when
-    that is 10, 50 and 90 %.
+    that is 10, 50 and 90 %. Bands are cut at the physical limits of a state; when one is beyond them the forecast ends.
+
+    Raises:
+        ConfigError: If an estimate is impossible now.
     """
+    least, most = np.array([state.limits or (-np.inf, np.inf) for state in model.shown_states]).T
+    left = (found.bands[:, -1] < least) | (found.bands[:, 0] > most)
+    end, ends = len(found.t), ""
+    if left.any():
+        k = int(np.argmax(left.any(axis=1)))
+        name = model.shown_states[int(np.argmax(left[k]))].name
+        if k == 0:
+            raise ConfigError(f"forecast: {name} is impossible now, so it has no future; see its episode")
+        end, ends = k + 1, f"; the forecast ends after {found.t[k]:.4g} s, when {name} leaves its physical limits"
+    found = found._replace(
+        t=found.t[:end], mean=np.clip(found.mean[:end], least, most), bands=np.clip(found.bands[:end], least, most)
+    )
     bands = {}
     for j, state in enumerate(model.shown_states):
         spread = float(np.nanmedian(found.std[:, j])) if np.isfinite(found.std[:, j]).any() else 0.0
@@ -136,7 +151,7 @@ def forecast_json(model: StateSpaceModel, here: Here, found: Forecast) -> dict[s
         # Digits down to a hundredth of σ: a place on the earth needs more than a temperature.
         digits = int(np.clip(3 + math.ceil(math.log10(size / spread)), 4, 14)) if spread > 0.0 < size else 8
         edges = {} if int(model.shown[j]) == model.mode else dict(zip(_EDGES, found.bands[:, :, j].T, strict=True))
-        mean = np.where(found.std[:, j] > state.withhold / HALF_WIDTH, np.nan, found.mean[:, j])
+        mean = np.where(found.std[:end, j] > state.withhold / HALF_WIDTH, np.nan, found.mean[:, j])
         bands[state.name] = {name: listed(values, digits) for name, values in {"mean": mean, **edges}.items()}
     return {
         "now": here.t * 1e-9,
@@ -147,7 +162,8 @@ def forecast_json(model: StateSpaceModel, here: Here, found: Forecast) -> dict[s
             f"share of {found.members} members that have passed the limit"
             if found.members
             else "probability of being beyond the limit, by mean and σ at each time"
-        ),
+        )
+        + ends,
         "t": listed(found.t),
         "states": bands,
         "inputs": dict(zip(model.input_names, listed(here.base.u), strict=True)),
@@ -159,12 +175,13 @@ _EDGES = ("lower2", "lower1", "upper1", "upper2")
 
 
 def _crossing(item: Crossing, t: np.ndarray) -> dict[str, Any]:
-    early, middle, late = (number(first_time(t, item.probability, share)) for share in SHARES)
+    probability = item.probability[: t.size]
+    early, middle, late = (number(first_time(t, probability, share)) for share in SHARES)
     return {
         "limit": item.limit,
         "above": item.above,
-        "probability": listed(item.probability, 3),
-        "overall": number(np.max(item.probability), 3),
+        "probability": listed(probability, 3),
+        "overall": number(np.max(probability), 3),
         "early": early,
         "middle": middle,
         "late": late,

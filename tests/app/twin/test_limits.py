@@ -1,6 +1,7 @@
 """Limits and ranges of validity as a twin's YAML says them: what they come to, what is refused, what is told of it."""
 
 import json
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -12,6 +13,7 @@ from app.cli.fold import fold_twin
 from app.live.alerts import rejections
 from app.live.counts import RowCounts
 from app.live.fold_json import base_from_json, base_to_json
+from app.twin.model import configure
 from app.twin.twin import load_twin
 from estimators.errors import ConfigError
 from estimators.fold import Fold
@@ -64,9 +66,14 @@ def test_limits_reach_the_sensor(limits, expected):
     assert ends == pytest.approx((2 * (-50 - 273.15) + 1, 2 * (605.35 - 273.15) + 1))
 
 
-def test_a_range_of_validity_takes_the_place_of_the_models():
-    model = twin_of(limited("use: true", "valid: {temperature: {min: 0, max: 150}}")).model
-    assert [state.fitted for state in model.states if state.name == "temperature"] == [(0.0, 150.0)]
+def test_ranges_take_the_place_of_the_models():
+    twin = twin_of(limited("use: true", "valid: {temperature: {min: 0, max: 150}}\npossible: {rate: {min: -9}}"))
+    temperature, rate = twin.model.states
+    assert (temperature.fitted, temperature.limits, rate.limits) == ((0.0, 150.0), None, (-9.0, np.inf))
+    # An absolute temperature is not negative, as its prior says; a difference of two may be.
+    model, loaded = replace(twin.model, states=(replace(temperature, unit="K"), replace(rate, unit="K"))), twin.loaded
+    loaded = replace(loaded, config=loaded.config.model_copy(update={"possible": {}}))
+    assert [state.limits for state in configure(model, loaded).states] == [(0.0, np.inf), (-9.0, np.inf)]
 
 
 @cases(__file__, "limits.csv")

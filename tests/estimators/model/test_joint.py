@@ -87,7 +87,11 @@ MOVED = joint(TANK, {"offset": JointParameter(0.1), "leak": JointParameter(0.1)}
 
 
 def test_parameters_keep_their_places_whichever_move() -> None:
-    assert MOVED.state_names == ("level", "leak", "offset")
+    assert [(state.name, state.limits) for state in MOVED.states] == [
+        ("level", None),
+        ("leak", (0.0, 1.0)),
+        ("offset", (-1.0, 1.0)),
+    ]
     compiled = compile_model(MOVED)
     out, y = np.empty(3), np.empty(1)
     x, p = np.array([2.0, 0.2, -0.5]), np.array([0.7])

@@ -3,6 +3,7 @@
 import asyncio
 import json
 import threading
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -12,11 +13,12 @@ from app.studies.analysis.forecast import Forecasts, forecast_json, question_fro
 from app.web.http import OneAtATime
 from app.web.server import PageServer
 from estimators.errors import ConfigError
-from estimators.forecast import Forecast, forecast
+from estimators.forecast import Crossing, Forecast, forecast
 from estimators.log import INPUT, READING, Events
 from estimators.models import MODELS
 from tests.app.scripted import MODEL, Scripted, pull_all, readings, twin
 from tests.app.served import SECRET, Client
+from tests.cases import cases
 from tests.support import SECOND
 
 
@@ -67,6 +69,21 @@ def test_a_place_on_the_earth_is_told_to_a_hundredth_of_its_deviation():
     said = forecast_json(MODEL, here, Forecast(np.arange(3.0), mean, std, bands, 0, ()))
     np.testing.assert_allclose(said["states"]["temperature"]["mean"], mean[:, 0], rtol=0, atol=2e-4)
     np.testing.assert_allclose(said["states"]["rate"]["upper2"], 0.04)
+
+
+def test_a_forecast_ends_where_it_leaves_the_physical_limits():
+    mean = np.array([[1.0, 0.0], [0.4, 0.0], [-0.1, 0.0], [-0.7, 0.0], [-1.2, 0.0]])
+    bands = mean[:, None] + np.array([-0.5, -0.25, 0.25, 0.5])[:, None]
+    model = replace(MODEL, states=(replace(MODEL.states[0], limits=(0.0, np.inf)), MODEL.states[1]))
+    found = Forecast(np.arange(5.0), mean, mean, bands, 0, (Crossing("temperature", 0.2, False, np.arange(5) / 5),))
+    said = forecast_json(model, running().here(), found)
+    shown = [said["states"]["temperature"][name] for name in ("lower2", "mean", "upper1", "upper2")]
+    expected = [[0.5, 0, 0, 0], [1, 0.4, 0, 0], [1.25, 0.65, 0.15, 0], [1.5, 0.9, 0.4, 0]]
+    np.testing.assert_allclose(shown, expected, atol=1e-9)
+    assert said["method"].endswith("; the forecast ends after 3 s, when temperature leaves its physical limits")
+    assert (said["t"], said["limits"]["temperature"]["overall"]) == ([0, 1, 2, 3], 0.6)
+    with pytest.raises(ConfigError, match="forecast: temperature is impossible now"):
+        forecast_json(model, running().here(), found._replace(bands=bands - 2.0))
 
 
 def test_inputs_hold_from_the_time_that_is_asked_for():
@@ -127,23 +144,14 @@ def test_nothing_of_the_running_twin_changes():
     np.testing.assert_array_equal(pull_all(engine).track.mean, pull_all(other).track.mean)
 
 
-def test_what_cannot_be_asked_is_refused_in_one_line():
-    model = MODELS["motor_drive"]
-    for body, reason in (
-        ([], "it takes horizon, inputs and limits"),
-        ({"horizon": 1, "more": 2}, "it takes horizon, inputs and limits"),
-        ({}, "horizon is None; it must be a finite number"),
-        ({"horizon": -1}, "it must be positive"),
-        ({"horizon": 1, "inputs": {"steam": 2}}, "names 'steam'; there are i_d, i_q"),
-        ({"horizon": 1, "inputs": {"i_q": [[2, 3]]}}, "changes at 2 s; it must be between 0 and the horizon"),
-        ({"horizon": 1, "inputs": {"i_q": []}}, "a number, or at most 200 pairs"),
-        ({"horizon": 1, "inputs": {"i_q": "much"}}, "'much'; it must be a finite number"),
-        ({"horizon": 1, "limits": {"rotor": 2}}, "names 'rotor'; there are"),
-        ({"horizon": 1, "limits": {"magnet": True}}, "True; it must be a finite number"),
-    ):
-        with pytest.raises(ConfigError) as refused:
-            question_from_json(body, model)
-        assert reason in str(refused.value) and "\n" not in str(refused.value)
+@cases(__file__, "refused_forecasts.csv")
+def test_what_cannot_be_asked_is_refused_in_one_line(body, reason):
+    with pytest.raises(ConfigError) as refused:
+        question_from_json(json.loads(body), MODELS["motor_drive"])
+    assert reason in str(refused.value) and "\n" not in str(refused.value)
+
+
+def test_a_forecast_needs_measurements_and_has_a_longest_horizon():
     engine = running()
     with pytest.raises(ConfigError, match=r"it may be 1e\+04 s at most"):
         ask(engine, horizon=1e6)
