@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from concurrent.futures import Executor
 from dataclasses import dataclass
 from typing import Any, NamedTuple
@@ -20,9 +20,10 @@ from estimators.diagnostics.sensitivity.checklist import Arrivals, Dimension, Li
 from estimators.diagnostics.sensitivity.gramian import directions
 from estimators.diagnostics.sensitivity.held_out import HeldOut, held_out
 from estimators.diagnostics.sensitivity.posterior import Peaks, Tail, tails
-from estimators.diagnostics.sensitivity.responses import NOW, PRIOR, digits
+from estimators.diagnostics.sensitivity.responses import NOW, PRIOR, SENSOR, digits
+from estimators.diagnostics.sensitivity.sensitivity import TWO_SIGMA
 from estimators.diagnostics.sensitivity.visibility import UndetectableFault
-from estimators.errors import NisusError
+from estimators.errors import NisusError, spaced
 from estimators.fold import Fold
 from estimators.log import READING, Log
 from estimators.model.state_space import StateSpaceModel
@@ -384,12 +385,13 @@ def _fault_topics(checked: Checked) -> list[Topic]:
                     moves,
                     BEGINS[one.begin],
                 )
-                for fault, one, moves in _by_harm(model, worse_faults(found, *checked.onsets))
+                for _, fault, one, moves in _by_harm(model, worse_faults(found, *checked.onsets))
             ],
             note,
             "Smallest fault that is detected with a probability of 95 %, the worse of two: present from the prior on, "
             f"for {found.window:.4g} s, or beginning later, for {checked.onsets[0].window:.4g} s. First the fault "
             "whose undetectable part moves a state furthest out of its band.",
+            *_missing_offsets(checked),
         )
         pairs = confounded(found)
         free = (
@@ -426,20 +428,33 @@ def _fault_topics(checked: Checked) -> list[Topic]:
     return [levels, smallest, _table(title, columns, views, f"{gramian.note}." if gramian.note else ""), alike]
 
 
+def _missing_offsets(checked: Checked) -> list[str]:
+    """Return which rows of sensors need an `offset`: an undetected one from the start moves a state out of its band."""
+    twin, found = checked.twin, checked.sensitivity
+    given = {name for name, section in twin.config.sensors.items() if section.offset is not None}
+    faults = [(fault, found) for fault in found.faults if fault.nudge.kind == SENSOR]
+    return [
+        f"{fault.nudge.name} has no offset: {fault.range_text} from the start passes unseen and moves {moves}. Declare "
+        f"its accuracy, sensors.{name}.offset: {{std: ...}}, and the band contains it."
+        for share, fault, _, moves in _by_harm(twin.model, faults)
+        if share > TWO_SIGMA and (name := fault.nudge.name.partition(".")[0]) not in given
+    ]
+
+
 def _by_harm(
-    model: StateSpaceModel, faults: Sequence[tuple[UndetectableFault, Sensitivity]]
-) -> list[tuple[UndetectableFault, Sensitivity, str]]:
+    model: StateSpaceModel, faults: Iterable[tuple[UndetectableFault, Sensitivity]]
+) -> list[tuple[float, UndetectableFault, Sensitivity, str]]:
     """Return faults by the largest error of a state, in its standard deviations, with that error in words."""
     found = []
     for fault, one in faults:
         with np.errstate(divide="ignore", invalid="ignore"):
             share = np.nan_to_num(fault.error[-1] / one.std[-1], nan=0.0, posinf=np.inf)
         k = int(np.argmax(share))
-        state, error = model.shown_states[k], float(fault.error[-1, k])
-        moves = f"{state.name} by {digits(error)} {state.unit}".rstrip() if error > 0.0 else "nothing"
+        state, error, band = model.shown_states[k], float(fault.error[-1, k]), TWO_SIGMA * float(one.std[-1, k])
+        size = f"{digits(error)}{spaced(state.unit)}"
+        moves = f"{state.name} by {size} (band ± {digits(band)})" if error > 0.0 else "nothing"
         found.append((float(share[k]), fault, one, moves))
-    found.sort(key=lambda item: -item[0])
-    return [(fault, one, moves) for _, fault, one, moves in found]
+    return sorted(found, key=lambda item: -item[0])
 
 
 def _held_out_topics(checked: Checked) -> list[Topic]:

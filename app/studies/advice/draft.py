@@ -28,6 +28,9 @@ from .plan import OMITTED, YAML_NAME, DraftCheck, DraftPlan, Moves, Reads
 from .signals import Signal, comes_by_chance
 
 _NAME = re.compile(r"[A-Za-z][A-Za-z0-9_-]*")
+MIN_OFFSET, MAX_OFFSETS = 0.1, 16
+"""Step of its values, in σ of its noise, from which the only sensor of a state has an offset of that size, and number
+of sensors up to which. Those of several sensors were fitted to each other."""
 MAX_NAME = 100
 """Longest name of a twin: a file system takes 255 bytes, with the ending and what an archive adds."""
 
@@ -274,7 +277,7 @@ def yaml_text(
     folder: Path,
 ) -> str:
     """The twin's YAML, with the recording as its source."""
-    noise, sensors = [], []
+    noise, sensors, read = [], [], drafted.sensors
     for item in drafted.states:
         unit = item.signal.series.unit or "1"
         over = f", over: {rounded(item.over):g} s" if item.over else ""
@@ -283,7 +286,10 @@ def yaml_text(
             f"  {item.second if item.smooth else item.name}: {{variance: {_number(item.q)}{over}}}  # {_line(what)}"
         )
         for reads in item.sensors:
-            fields = f"std: {_number(math.sqrt(reads.r))}"
+            std, step = math.sqrt(reads.r), reads.signal.resolution
+            fields = f"std: {_number(std)}"
+            if step > MIN_OFFSET * std and len(item.sensors) == 1 and len(read) <= MAX_OFFSETS:
+                fields += f", offset: {{std: {_number(step)}}}"
             if reads.error is not None:
                 size, time = _number(rounded(reads.error[0])), rounded(reads.error[1])
                 fields += f", error: {{variance: {size}, over: {time:g} s}}"
@@ -292,7 +298,6 @@ def yaml_text(
             what = "the rate of " if reads.rate else ""
             unit = reads.signal.series.unit or "1"
             sensors.append(f"  {reads.name}: {{{fields}}}  # {_line(unit)}; measures {what}{item.name}")
-    read = drafted.sensors
     source = _source(drafted, found, databases, folder)
     first = next((f"[{item.name}, {item.second}]" for item in drafted.states if item.smooth), None)
     if first is None and len(drafted.states) > 1:
@@ -316,7 +321,8 @@ model: ./{name}.py:{model}       # file beside this one, and the name of the mod
 noise:  # model uncertainty, per second; over: how long a disturbance lasts
 {text(noise)}
 
-sensors:  # std: white noise, at least the resolution; error: noise with memory; use: false holds a sensor out
+sensors:  # std: white noise, at least the resolution; error: noise with memory; use: false holds a sensor out;
+  # offset: constant error, part of the bands; give the accuracy of the data sheet (here one step of its values)
 {text(sensors)}
 
 {_estimator(drafted, name)}

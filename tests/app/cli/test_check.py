@@ -102,6 +102,12 @@ def test_html_is_one_file_without_scripts(checked):
     assert "url(" not in html and "@import" not in html
     assert "svg" in page.tags and "table" in page.tags
     assert "Checklist" in page.text
+    # What is measured directly is wrong by the offset of its only sensor.
+    said = next(text for text in page.text if text.startswith("winding has no offset: "))
+    size, moved, band = map(
+        float, re.findall(r"± ([\d.]+) °C from .* temperature by ([\d.]+) °C \(band ± ([\d.]+)\)", said)[0]
+    )
+    assert moved == pytest.approx(size, rel=0.02) and size > band
 
 
 def test_html_escapes_what_users_name():
