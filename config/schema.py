@@ -112,8 +112,6 @@ class ParameterSection(Section):
             raise refused("relation", "is for a parameter with `use: estimated`; leave it out", "drift")
         if "use" in self.model_fields_set and self.use == "considered" and self.std is None and not self.widen:
             raise refused("absent", "is considered and needs a standard deviation, as in std: 10 %", "std")
-        if self.use == "estimated" and self.widen:
-            raise refused("relation", "is for a considered parameter; the width of an estimated one evolves", "widen")
         return self
 
     def spread(self, value: float) -> float | None:

@@ -125,9 +125,9 @@ def fold_event(
             if variances:
                 for k in range(rows):
                     r[k] = kept[k]
-            if memory != 0 and verdict == USED:
-                after_update(context, memory, state)
             if verdict == GATED or verdict == USED:
+                if memory != 0:
+                    after_update(context, memory, state, sensor, innovation[i], innovation_std[i])
                 beyond = score[0] > limit_of(context, sensor, int(score[1]))
                 asked = note(doubt[sensor], rule.most, beyond, index, float(t[i]))
         call_describe(code.describe, context, state, mean[i], std[i], cross[i])

@@ -15,7 +15,7 @@ import numpy as np
 
 from estimators.diagnostics.considered_shares import considered_pairs
 from estimators.diagnostics.episodes import Episode, TrackedEpisode
-from estimators.diagnostics.references import hidden_states
+from estimators.diagnostics.references import withheld
 from estimators.errors import EstimatorError
 from estimators.fold import Fold
 from estimators.log import READING, Events, Log
@@ -319,10 +319,10 @@ class Running(ABC):
         with self._reading() if past is None else nullcontext():
             fold = self._fold if past is None else past
             mean, cov = fold.moments()
-            points, clock = fold.points(), fold.clock
+            points, clock, row = fold.points(), fold.clock, fold.track.select(slice(-1, None)).copy()
         # Clustering takes milliseconds, which the engine's thread must not wait for.
         peaks = peaks_of(points, fold.model.circular) if fold.estimator.peaks is not None else []
-        hidden = hidden_states(fold.model, cov)
+        hidden = np.asarray(fold.model.shown)[withheld(fold.model, row).any(axis=0)]
         if hidden.size:
             mean, points, peaks = mean.copy(), points.copy(), []
             mean[hidden], points[:, hidden] = np.nan, np.nan

@@ -277,9 +277,10 @@ DETECTORS = (
     ),
     Detector(
         "corrected",
-        "{0.name} is corrected {0.since} by more than its band allows, over the time in which it forgets",
+        "{0.name} is corrected {0.since} by more than its band allows, over its memory or from its prior",
         "its true value may lie outside the band, as the model or an input is wrong; `nisus check` compares them",
-        statistic="sum of corrections that leave 20 to 90 % of the variance of a forecast, tested at variance 2.5",
+        statistic="sum of corrections that leave 20 to 90 % of the variance of a forecast, tested at variance 2.5; "
+        "the first measurement of a sensor beyond 5 σ",
         effect="the value",
     ),
     Detector(

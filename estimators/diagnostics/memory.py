@@ -36,6 +36,8 @@ MAX_STATES = 32  # States of a model whose memory is followed
 LOW, HIGH = 0.2, 0.9  # ρ of the times that are a state's memory
 VARIANCE = 2.5  # Of z, that the tests look for
 MAX_Z = 6.0  # |z| is clipped here: a single correction is no proof
+MAX_SENSORS = 52  # Sensors whose first measurement is known from another's; a float64 holds their bits
+FIRST_SIGMA = 5.0  # |e| of the first measurement of a sensor that contradicts the prior
 BEYOND = np.log(100.0)  # log Λ from which a state is in alarm, until it is half of that; twice that is its highest
 
 COVARIANCE, FACTOR = 1, 2  # What follows the mean in the state of a filter
@@ -48,6 +50,9 @@ Memory, memory_of = declare_layout(
     time_of,
     scratch_size,
     count="2",  # measurements of the present time; bits of the states in alarm
+    first="3",  # bits of sensors heard; e of a contradicted prior, or 0; bits of the states that are still its own
+    B="n, n",
+    G="n, n",
     now="Time(at, n)",
     joined="Time(at, n)",
     x="n",
@@ -125,6 +130,7 @@ def forget_memory(at, n):
     """Begin again: after a reset, or where a number is not finite."""
     own = memory_of(at, n)
     own.count[0] = own.count[1] = 0.0
+    own.first[:] = 0.0
     _clear(own.now)
     for k in range(LEVELS):
         level = level_of(own.end + 8 * k * level_words(n), n)
@@ -139,6 +145,9 @@ def carry_memory(context, at, x, u, dt):
     own = memory_of(at, context.nx)
     state_jacobian(context, x, u, dt, own.F, own.jacobian)
     _carry(own.F, estimated(context), own.now, own.products)
+    if own.first[1] > 0.0:
+        congruence(own.F, estimated(context), own.B, own.products)
+        congruence(own.F, estimated(context), own.G, own.products)
 
 
 @inlined
@@ -164,11 +173,12 @@ def before_update(context, at, state):
 
 
 @part
-def after_update(context, at, state):
-    """Add a correction, and judge the times that end with it."""
+def after_update(context, at, state, sensor, innovation, std):
+    """Add a correction, and judge the times that end with it; ν and √diag S (ny,) tell whether the prior was wrong."""
     n = context.nx
     own, circular = memory_of(at, n), circular_states(context)
     now = own.now
+    _hear(own, 1 << min(sensor, MAX_SENSORS), estimated(context), innovation, std)
     copy(own.P, own.F)
     _spread(context.memory, n, state, own.P)
     for i in range(n):
@@ -176,15 +186,52 @@ def after_update(context, at, state):
         now.d[i] += wrap(moved) if circular[i] != 0 else moved
         for j in range(n):
             now.D[i, j] += own.F[i, j] - own.P[i, j]
+            own.G[i, j] += own.F[i, j] - own.P[i, j]
+    if own.first[1] > 0.0:
+        _weigh_prior(context, own)
     own.count[0] += 1.0
     if own.count[0] >= FIRST:
         _end_time(context, at, own)
 
 
 @inlined
+def _hear(own, bit, estimated, innovation, std):
+    """Note whether the first measurement of a sensor, used or refused, contradicts the prior of what is estimated."""
+    if int(own.first[0]) & bit == 0:
+        own.first[0] += bit
+        for k in range(innovation.size):
+            e = abs(innovation[k]) / std[k]
+            if e > FIRST_SIGMA:
+                own.first[1] = max(own.first[1], min(e, MAX_Z))
+                copy(own.P, own.B)
+                own.G[:] = 0.0
+                own.B[estimated:] = 0.0
+                own.B[:, estimated:] = 0.0
+
+
+@inlined
+def _weigh_prior(context, own):
+    """Find the states in which a prior that is wrong by e of its deviations still leaves more than one of theirs.
+
+    The prior gives B = Φ P₀ Φᵀ of the variance P + G of a forecast from it, and measurements have left the share
+    ρ = P / (P + G) of its error: e ρ √B > √P.
+    """
+    bits, shown, e = 0, shown_states(context), own.first[1]
+    for s in range(min(shown.size, MEMORY_FLAGS)):
+        j = shown[s]
+        forecast = own.P[j, j] + own.G[j, j]
+        if context.graded >> s & 1 != 0 and e * e * own.B[j, j] * own.P[j, j] > forecast * forecast:
+            bits |= 1 << s
+    own.first[2] = bits
+    if bits == 0:
+        own.first[1] = 0.0
+
+
+@inlined
 def memory_flags(at, n):
     """Return the bits of `Track.flags` of the states in alarm."""
-    return int(memory_of(at, n).count[1]) << MEMORY_AT
+    own = memory_of(at, n)
+    return (int(own.count[1]) | int(own.first[2])) << MEMORY_AT
 
 
 @inlined

@@ -61,23 +61,20 @@ HALF_WIDTH = 1.959963984540054  # Half-width of a 95 % band, in standard deviati
 
 
 def withheld(model: StateSpaceModel, track: Track) -> np.ndarray:
-    """Return where a shown state is withheld, (n, shown): its band exceeds its limit, or the model is far out."""
-    limits = np.array([state.withhold for state in model.shown_states])
-    far = (track.flags & FAR_OUTSIDE != 0)[:, np.newaxis]
-    return (track.std > limits / HALF_WIDTH) | far & np.isfinite(limits)
+    """Return where a shown state is withheld, (n, shown)."""
+    return np.column_stack([hidden(track, k, state.withhold) for k, state in enumerate(model.shown_states)])
+
+
+def hidden(track: Track, column: int, limit: float) -> np.ndarray:
+    """Return where a shown state with this limit is withheld, (n,): its band exceeds it, or the model is far out."""
+    far = track.flags & (FAR_OUTSIDE if limit < np.inf else 0) != 0
+    return (track.std[:, column] > limit / HALF_WIDTH) | far
 
 
 def shown_track(model: StateSpaceModel, track: Track) -> Track:
     """Return a track with NaN in place of the withheld estimates, for views of the mean."""
-    hidden = withheld(model, track)
-    return track._replace(mean=np.where(hidden, np.nan, track.mean)) if hidden.any() else track
-
-
-def hidden_states(model: StateSpaceModel, cov: np.ndarray) -> np.ndarray:
-    """Return the indices of the states whose estimate is withheld, given a covariance (nx, nx) or variances (1, nx)."""
-    variance = np.diag(cov) if len(cov) == model.nx else cov[0]
-    limits = np.array([state.withhold for state in model.shown_states])
-    return np.asarray(model.shown)[variance[model.shown] > (limits / HALF_WIDTH) ** 2]
+    where = withheld(model, track)
+    return track._replace(mean=np.where(where, np.nan, track.mean)) if where.any() else track
 
 
 WITHHELD = "withheld"  # Grade of a state beside those of health
@@ -126,14 +123,14 @@ def own_grades(model: StateSpaceModel, track: Track, u: np.ndarray) -> dict[str,
     ]
     why = f"outside the fitted range ({'; '.join(left)})" if left else "too uncertain"
     grades = {
-        state.name: (HEALTH_NAMES[SUSPECT], "corrected over its memory by more than its band allows")
+        state.name: (HEALTH_NAMES[SUSPECT], "corrected by more than its band allows, over its memory or from its prior")
         for k, state in enumerate(model.shown_states)
         if track.flags[-1] & memory_flag(k)
     }
     return grades | {
         state.name: (WITHHELD, f"{why}, ± {_two_digits(HALF_WIDTH * deviation)}{spaced(state.unit)}")
-        for state, deviation, hidden in zip(model.shown_states, std, withheld(model, track)[-1], strict=True)
-        if hidden
+        for state, deviation, without in zip(model.shown_states, std, withheld(model, track)[-1], strict=True)
+        if without
     }
 
 

@@ -120,8 +120,8 @@ class JointParameter(NamedTuple):
     """A parameter to estimate or to consider: `std` is that of its prior about its value, `drift` what a second adds.
 
     A considered one keeps its value whatever is measured, and the covariance of the states accounts for its `std`.
-    `widened` is the standard deviation that a unit of distance outside the fitted range of a state or an input adds to
-    a considered one, by their names; with it `std` may be 0.
+    `widened` is the standard deviation that a unit of distance outside the fitted range of a state or an input adds, by
+    their names; with it `std` may be 0. What it adds to an estimated one is considered.
     """
 
     std: float
@@ -160,11 +160,9 @@ def joint(
             )
         if given.considered and given.drift:
             raise ModelError(f"model {model.name}: {name} is considered, so it cannot drift; leave the drift out")
-        if given.widened and not given.considered:
-            raise ModelError(f"model {model.name}: {name} is estimated, so its width is the filter's; leave widen out")
     marked = [item for item in model.parameters if item.name in estimated and estimated[item.name].considered]
     considered = [item for item in marked if estimated[item.name].std > 0.0]
-    widened = [item for item in marked if estimated[item.name].widened]
+    widened = [item for item in model.parameters if item.name in estimated and estimated[item.name].widened]
     moved = [item for item in model.parameters if item.name in estimated and item not in marked]
     kept = [item for item in model.parameters if item not in moved]
     added = [*moved, *considered]
@@ -184,10 +182,7 @@ def joint(
         model,
         states=(
             *model.states,
-            *(
-                State(m.name, m.unit, m.value, estimated[m.name].std, limits=(m.low, m.high), appended=True)
-                for m in moved
-            ),
+            *(_moved(item, estimated[item.name]) for item in moved),
             *(State(deviation(m.name), m.unit, 0.0, estimated[m.name].std) for m in considered),
             *(State(outside(m.name), "1", 0.0, 1.0) for m in widened),
         ),
@@ -207,6 +202,16 @@ def joint(
     if model.linear and not widened and is_linear(found):
         found = replace(found, linear=True)
     return _correlated(found, [item.name for item in considered], correlations or {})
+
+
+FAR_FROM_PRIOR = 4.0  # Standard deviations of its prior within which an estimated constant should stay
+
+
+def _moved(item: Parameter, given: JointParameter) -> State:
+    """Return the state of an estimated parameter; the model is outside its range where a constant leaves its prior."""
+    far, limits = FAR_FROM_PRIOR * given.std, (item.low, item.high)
+    fitted = None if given.drift else (item.value - far, item.value + far)
+    return State(item.name, item.unit, item.value, given.std, fitted=fitted, limits=limits, appended=True)
 
 
 def is_linear(model: StateSpaceModel) -> bool:

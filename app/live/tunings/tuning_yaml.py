@@ -115,9 +115,8 @@ def _fitted_ranges(
     found = {name: section.model_dump(mode="json", exclude_unset=True) for name, section in config.valid.items()}
     if widths is None:
         return found
-    items: tuple[State | Input, ...] = (
-        model.inputs if isinstance(model.states, Field) else (*model.states, *model.inputs)
-    )
+    states = () if isinstance(model.states, Field) else model.states
+    items: list[State | Input] = [*(state for state in states if not state.appended), *model.inputs]
     limited = {item.name for item in items if item.fitted is not None}
     limited |= {place for section in parameter_sections(model, config).values() for place in section.widen}
     for name in sorted(limited & set(widths.envelope)):

@@ -9,7 +9,7 @@ from typing import NamedTuple
 import numpy as np
 
 from estimators.diagnostics.considered_shares import noise_states, noise_std
-from estimators.diagnostics.references import HALF_WIDTH
+from estimators.diagnostics.references import hidden
 from estimators.log import INPUT, READING, Events, truth_of
 from estimators.model.state_space import StateSpaceModel
 from estimators.track import FAILED, GATED, HELD_OUT, USED, Track, estimated_rows
@@ -106,7 +106,7 @@ def units_by_name(model: StateSpaceModel) -> dict[str, str]:
 def _mean(j: int, spread: float, rows: Rows, withhold: float = np.inf) -> np.ndarray:
     track = rows.track
     value = track.mean[:, j] + spread * track.std[:, j] if spread else track.mean[:, j]
-    shown = rows.estimated if withhold == np.inf else rows.estimated & (track.std[:, j] <= withhold / HALF_WIDTH)
+    shown = rows.estimated if withhold == np.inf else rows.estimated & ~hidden(track, j, withhold)
     return np.where(shown, value, np.nan)
 
 

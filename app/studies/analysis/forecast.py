@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 import time
-from collections.abc import Mapping, Sequence
+from collections.abc import Container, Mapping, Sequence
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -116,17 +116,17 @@ class Forecasts:
                 f"forecast: {float(found.t[np.argmax(lost)]):.4g} s from now a state is beyond {LARGEST:g}, or no "
                 "number; are the inputs possible? or ask for a shorter horizon"
             )
-        told = forecast_json(self._engine.model, here, found)
+        told = forecast_json(self._engine.model, here, found, self._engine.status().withheld)
         chosen = {name: drawn_changes(changes) for name, changes in inputs.items()}
         return {**told, "chosen": chosen, "step": step, "took": time.monotonic() - begun}
 
 
-def forecast_json(model: StateSpaceModel, here: Here, found: Forecast) -> dict[str, Any]:
+def forecast_json(model: StateSpaceModel, here: Here, found: Forecast, withheld: Container[str]) -> dict[str, Any]:
     """Return a forecast as JSON.
 
     `now` is in seconds of the log, `t` in seconds from then; `states` have mean and the edges of their ± 1σ and ± 2σ
-    bands, a probability its mean alone; the mean is null where the state is withheld. `inputs` are those that hold now.
-    Of each limit: whether it is looked at from below, the probability of it over the horizon and at each time, and when
+    bands, a probability its mean alone; the mean is null where the state is withheld, or among those `withheld` now.
+    `inputs` are those that hold now. Of each limit: whether it is looked at from below, the probability of it over the horizon and at each time, and when
     that is 10, 50 and 90 %. Bands are cut at the physical limits of a state; when one is beyond them the forecast ends.
 
     Raises:
@@ -151,7 +151,8 @@ def forecast_json(model: StateSpaceModel, here: Here, found: Forecast) -> dict[s
         # Digits down to a hundredth of σ: a place on the earth needs more than a temperature.
         digits = int(np.clip(3 + math.ceil(math.log10(size / spread)), 4, 14)) if spread > 0.0 < size else 8
         edges = {} if int(model.shown[j]) == model.mode else dict(zip(_EDGES, found.bands[:, :, j].T, strict=True))
-        mean = np.where(found.std[:end, j] > state.withhold / HALF_WIDTH, np.nan, found.mean[:, j])
+        hidden = (found.std[:end, j] > state.withhold / HALF_WIDTH) | (state.name in withheld)
+        mean = np.where(hidden, np.nan, found.mean[:, j])
         bands[state.name] = {name: listed(values, digits) for name, values in {"mean": mean, **edges}.items()}
     return {
         "now": here.t * 1e-9,

@@ -58,7 +58,7 @@ def cell(scale, n, seed=0):
 
 
 def by_forecasts(log, first, end):
-    """z and rho of both states, from a forecast without the measurements `first` to `end` of a dense Kalman filter."""
+    """z, rho and variance of both states, from a forecast without measurements `first` to `end` of a dense filter."""
     F, Q, H = np.diag([1.0, 0.95]), np.diag([1e-8, 1e-4]), np.array([1.0, 0.05])
     u, y = log.value[0 : log.n : 2, 0], log.value[1 : log.n : 2, 0]
     x, P, start = np.array([0.5, 0.0]), np.diag([0.05**2, 0.1**2]), None
@@ -74,7 +74,7 @@ def by_forecasts(log, first, end):
         K = P @ H / (H @ P @ H + VOLTAGE)
         x, P = x + K * (y[k] - H @ x), P - np.outer(K, H @ P)
     spread = np.diag(start[1] - P)
-    return (x - start[0]) / np.sqrt(spread), np.diag(P) / np.diag(start[1])
+    return (x - start[0]) / np.sqrt(spread), np.diag(P) / np.diag(start[1]), np.diag(P)
 
 
 @pytest.mark.parametrize("name", ["kf", "ekf", "ukf", "sr-kf", "sr-ukf"])
@@ -85,7 +85,7 @@ def test_corrections_are_those_since_a_forecast(name):
     for k, times in enumerate((((0, 32), (16, 48), (32, 64)), ((0, 64),))):
         W = np.zeros(2)
         for time in times:
-            z, rho = by_forecasts(log, *time)
+            z, rho, _ = by_forecasts(log, *time)
             # Half of log Λ of the variance 2.5 against 1, as the times overlap by half.
             gained = np.where((rho > 0.2) & (rho < 0.9), 0.15 * np.clip(z, -6.0, 6.0) ** 2 - 0.25 * np.log(2.5), 0.0)
             W = np.maximum(W + gained, 0.0)
@@ -114,9 +114,23 @@ def test_a_steady_error_that_no_sensor_shows_is_told_of_the_state_that_it_moves(
     assert (~held & ~own).mean() <= 0.05 and own.mean() > 0.5
     assert not (fold.track.flags & memory_flag(1)).any() and np.array_equal(own, twin)
     found = own_grades(CELL, fold.track, fold.u)
-    assert found == {"charge": ("suspect", "corrected over its memory by more than its band allows")}
+    assert found == {"charge": ("suspect", "corrected by more than its band allows, over its memory or from its prior")}
     *_, unwatched, _ = told(0.9, replace(CELL, states=(replace(CELL.states[0], watched=False), CELL.states[1])))
     assert not unwatched.any()
+
+
+@pytest.mark.parametrize("gate", [None, 0.999])
+def test_a_prior_that_the_first_measurement_contradicts_is_told_of_what_it_still_determines(gate):
+    """While 6 of its deviations, forecast and reduced by the measurements, are more than one of the state's own."""
+    log, _ = cell(1.0, 400)
+    far = replace(CELL, states=(replace(CELL.states[0], mean=1.2), CELL.states[1]))
+    track = folded("kf", far, log, policy=QUIET, tuning=replace(Tuning.of(far), gate=gate)).track
+    own = (track.flags[3::2, None] & [memory_flag(0), memory_flag(1)]) != 0
+    rho, P = np.array([by_forecasts(log, 0, end)[1:] for end in range(2, 401)]).swapaxes(0, 1)
+    if gate:  # which refuses all measurements
+        rho, P = 1.0, P / rho
+    error = 6.0 * rho * np.column_stack((np.full(399, 0.05), 0.1 * 0.95 ** np.arange(1, 400)))
+    np.testing.assert_array_equal(own, error > np.sqrt(P))
 
 
 def test_a_reset_begins_again():

@@ -167,11 +167,12 @@ def ranged():
 
 
 def by_hand(model):
-    """The same with p + δ + η Σ w d written out, on states (a, b, δ_offset, δ_loss, η_loss, η_heat)."""
+    """The same with p + δ + η Σ w d written out, on states (a, b, [heat,] δ_offset, δ_loss, η_loss, η_heat)."""
 
     def effective(x, u, p):
         a, b = np.maximum(0.0, x[0].real - 1.9), np.maximum(0.0, u[0] - 0.25)
-        return [p[0] + x[2], p[1] + x[3] + (0.05 * a + 0.4 * b) * x[4], p[2] + 0.7 * b * x[5]]
+        d_offset, d_loss, loss, heat = x[-4:]
+        return [p[0] + d_offset, p[1] + d_loss + (0.05 * a + 0.4 * b) * loss, (*p, x[2])[2] + 0.7 * b * heat]
 
     def forward(x, u, p, dt, out):
         f(x, u, effective(x, u, p), dt, out)
@@ -185,10 +186,12 @@ def by_hand(model):
 
 
 @pytest.mark.parametrize("estimator", ["ekf", "sr-ekf"])
-def test_correlated_and_widened_parameters_equal_the_equations_in_blocks(estimator):
-    model = joint(ranged(), FITTED, {("loss", "offset"): -0.8})
-    assert model.state_names[2:] == ("offset_deviation", "loss_deviation", "loss_outside", "heat_outside")
-    assert model.prior_cov[2, 3] == pytest.approx(-0.8 * 0.3 * 0.02)
+@pytest.mark.parametrize("moved", [(), ("heat",)], ids=["considered", "estimated"])
+def test_correlated_and_widened_parameters_equal_the_equations_in_blocks(estimator, moved):
+    heat = {name: JointParameter(1.0, widened={"power": 0.7}) for name in moved}
+    model = joint(ranged(), FITTED | heat, {("loss", "offset"): -0.8})
+    assert model.state_names[2:] == (*moved, "offset_deviation", "loss_deviation", "loss_outside", "heat_outside")
+    assert model.prior_cov[-4, -3] == pytest.approx(-0.8 * 0.3 * 0.02)
     equal_to_the_equations(estimator, model, {}, by_hand(model))
 
 
@@ -200,7 +203,6 @@ def test_correlated_and_widened_parameters_equal_the_equations_in_blocks(estimat
          {("offset", "heat"): 0.9, ("offset", "loss"): 0.9, ("heat", "loss"): -0.9}, "contradict each other"),
         ({"loss": JointParameter(0.0, considered=True, widened={"b": 1.0})}, {}, "range of b, which has none"),
         ({"loss": JointParameter(0.0, considered=True, widened={"c": 1.0})}, {}, "no state or input 'c'"),
-        ({"loss": JointParameter(0.1, widened={"a": 1.0})}, {}, "leave widen out"),
     ],
 )  # fmt: skip
 def test_impossible_widths_are_refused(estimated, correlations, rule):

@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 
 from estimators.compiled.model import compile_model
+from estimators.diagnostics.detectors import OUTSIDE
 from estimators.errors import ModelError
 from estimators.fold import fold
 from estimators.log import READING, Events, Log
@@ -14,7 +15,7 @@ from estimators.model.state_space import Noise, Parameter, Row, Sensor, State, S
 from estimators.models import MODELS
 from estimators.tuning import Tuning
 from tests.models import level_model
-from tests.support import SECOND
+from tests.support import SECOND, folded
 
 
 def fall(x, u, p, dt, out):
@@ -81,6 +82,14 @@ def test_an_unknown_inflow_is_estimated_as_by_a_kalman_filter_augmented_by_hand(
     np.testing.assert_allclose(got.mean, exact.mean, rtol=0, atol=1e-9)
     np.testing.assert_allclose(got.std, exact.std, rtol=0, atol=1e-9)
     np.testing.assert_allclose(got.log_likelihood, exact.log_likelihood, rtol=0, atol=1e-8)
+
+
+@pytest.mark.parametrize("drift", [0.0, 1e-4])
+def test_a_model_is_outside_its_range_where_an_estimated_constant_has_left_its_prior(drift: float) -> None:
+    track = folded("ekf", joint(TANK, {"inflow": JointParameter(0.02, drift)}), readings(2000)).track
+    far = np.abs(track.mean[:, 1] - 0.3) > 4.4 * 0.02
+    assert far[-1] and not far[0]
+    np.testing.assert_array_equal(track.flags & OUTSIDE != 0, far & (drift == 0.0))
 
 
 MOVED = joint(TANK, {"offset": JointParameter(0.1), "leak": JointParameter(0.1)})

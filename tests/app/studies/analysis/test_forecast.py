@@ -66,7 +66,7 @@ def test_a_place_on_the_earth_is_told_to_a_hundredth_of_its_deviation():
     std = np.full((3, 2), 0.02)
     mean = np.array([[4_123_456.789, 0.0], [4_123_457.123, 0.0], [4_123_457.456, 0.0]])
     bands = mean[:, None] + np.array([-2, -1, 1, 2])[None, :, None] * std[:, None]
-    said = forecast_json(MODEL, here, Forecast(np.arange(3.0), mean, std, bands, 0, ()))
+    said = forecast_json(MODEL, here, Forecast(np.arange(3.0), mean, std, bands, 0, ()), ())
     np.testing.assert_allclose(said["states"]["temperature"]["mean"], mean[:, 0], rtol=0, atol=2e-4)
     np.testing.assert_allclose(said["states"]["rate"]["upper2"], 0.04)
 
@@ -76,14 +76,14 @@ def test_a_forecast_ends_where_it_leaves_the_physical_limits():
     bands = mean[:, None] + np.array([-0.5, -0.25, 0.25, 0.5])[:, None]
     model = replace(MODEL, states=(replace(MODEL.states[0], limits=(0.0, np.inf)), MODEL.states[1]))
     found = Forecast(np.arange(5.0), mean, mean, bands, 0, (Crossing("temperature", 0.2, False, np.arange(5) / 5),))
-    said = forecast_json(model, running().here(), found)
+    said = forecast_json(model, running().here(), found, ())
     shown = [said["states"]["temperature"][name] for name in ("lower2", "mean", "upper1", "upper2")]
     expected = [[0.5, 0, 0, 0], [1, 0.4, 0, 0], [1.25, 0.65, 0.15, 0], [1.5, 0.9, 0.4, 0]]
     np.testing.assert_allclose(shown, expected, atol=1e-9)
     assert said["method"].endswith("; the forecast ends after 3 s, when temperature leaves its physical limits")
     assert (said["t"], said["limits"]["temperature"]["overall"]) == ([0, 1, 2, 3], 0.6)
     with pytest.raises(ConfigError, match="forecast: temperature is impossible now"):
-        forecast_json(model, running().here(), found._replace(bands=bands - 2.0))
+        forecast_json(model, running().here(), found._replace(bands=bands - 2.0), ())
 
 
 def test_inputs_hold_from_the_time_that_is_asked_for():
