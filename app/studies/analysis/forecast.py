@@ -126,8 +126,9 @@ def forecast_json(model: StateSpaceModel, here: Here, found: Forecast, withheld:
 
     `now` is in seconds of the log, `t` in seconds from then; `states` have mean and the edges of their ± 1σ and ± 2σ
     bands, a probability its mean alone; the mean is null where the state is withheld, or among those `withheld` now.
-    `inputs` are those that hold now. Of each limit: whether it is looked at from below, the probability of it over the horizon and at each time, and when
-    that is 10, 50 and 90 %. Bands are cut at the physical limits of a state; when one is beyond them the forecast ends.
+    `inputs` are those that hold now. Of each limit: whether it is looked at from below, the probability of it over the
+    horizon and at each time, and when that is 10, 50 and 90 %. Bands are cut at the physical limits of a state; when
+    one is beyond them the forecast ends.
 
     Raises:
         ConfigError: If an estimate is impossible now.
