@@ -24,13 +24,13 @@ from ..numerics.random import ONE, key_of, normal
 from ..track import FAILED, GATED, MISSING, USED
 from .cloud import DRAW, OPTIONS, RESAMPLE, count_of, describe, own_cloud, own_covariance, score_cloud
 from .draws import reconsider, recover, start
-from .innovation import finite_rows
+from .innovation import expected_reading, finite_rows
 from .proposals import (
+    EXPECT,
     PROPOSE,
     WAITING,
     densities_of,
     expect_block,
-    expected_reading,
     move_block,
     place_draw,
     predict,
@@ -86,7 +86,7 @@ def update(context, u, sensor, y, index, state, work, innovation, innovation_std
     """Choose by the predictive density, move, and weigh by the ratio of the density to its prediction."""
     if finite_rows(y, sensor_variances(context, sensor).size) == 0:
         return MISSING
-    index, verdict = expected_reading(context, u, sensor, y, state, work, innovation, innovation_std, score)
+    index, verdict = expected_reading(EXPECT, context, u, sensor, y, state, work, innovation, innovation_std, score)
     # First stage: λ_j = w_j p̂_j(y), the log weights that `expected_reading` left
     log_sum = normalise(context, state, work)
     if verdict == USED and log_sum > -np.inf:

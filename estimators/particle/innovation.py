@@ -7,11 +7,13 @@ import numpy as np
 from ..compiled.context import circular_rows, expect, has_own_likelihood, own_likelihood, sensor_variances
 from ..compiled.noise import add_covariances, has_correlated_rows
 from ..compiled.verdict import LOG_2PI
+from ..gaussian.shared import admit
 from ..numerics.jit import jit
 from ..numerics.linalg import solve_unit, wrap
-from ..numerics.normal_score import normal_score
+from ..numerics.normal_score import add_tail, normal_score
 from ..track import WHITENED
-from .cloud import tails_of
+from .cloud import SETTLED, next_draw, own_cloud, tails_of
+from .weights import NO_KEY, add_up, sweep, work_of
 
 
 @jit
@@ -46,6 +48,50 @@ def finite_rows(y, rows):
         if np.isfinite(y[row]):
             m += 1
     return m
+
+
+@jit
+def add_gaussian(context, sensor, y, w, reference, e, S, sums):
+    """Add a particle's N(e, S) of the residual over the finite rows to the sums, with weight w, and its two tails.
+
+    e becomes the deviation from the reference, S the covariance without R.
+    """
+    r = sensor_variances(context, sensor)
+    circular = circular_rows(context, sensor)
+    tails = tails_of(context, sums)
+    sums[0] += w
+    m = 0
+    for row in range(r.size):
+        if np.isfinite(y[row]):
+            e[m] = about(e[m], reference[row], circular[row])
+            if not has_own_likelihood(context, sensor):
+                add_tail((reference[row] + e[m]) / np.sqrt(S[m, m]), w, tails[2 * m :])
+            S[m, m] -= r[row]
+            m += 1
+    add_covariances(context, sensor, y, -1.0, S)
+    for a in range(m):
+        sums[4 + a] += w * e[a]
+        for b in range(a + 1):
+            sums[4 + m + a * m + b] += w * (e[a] * e[b] + S[a, b])
+
+
+@jit
+def expected_reading(phase, context, u, sensor, y, state, work, innovation, innovation_std, score):
+    """Run the phase of the joint weights and the residuals' moments; fill the innovation and the scores.
+
+    Returns:
+        The index of the filter's draws, and the verdict of the gate.
+    """
+    shared, x = work_of(context, work), own_cloud(context, state).records[0, : context.nx]
+    settled = state[SETTLED]
+    index = next_draw(state)
+    sweep(phase, context, u, 0.0, sensor, y, NO_KEY, 0.0, state, work)
+    add_up(context, work)
+    m = predicted(context, u, sensor, y, x, shared, innovation, innovation_std)
+    state[SETTLED] = settled
+    verdict = admit(context, sensor, m, shared.nu, shared.S, shared.U, score)
+    score_rows(context, sensor, y, shared, score)
+    return index, verdict
 
 
 @jit

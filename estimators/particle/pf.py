@@ -2,17 +2,19 @@
 
 x_i ~ p(x | x_i'),  w_i ∝ w_i' p(y | x_i); resampled when the effective sample size is low. NIS is that of the weighted
 mean and covariance of h(x_i), so it means the same as a Gaussian filter's; the log-likelihood is that of the particles,
-log Σ w_i' p(y | x_i), whose exponential, multiplied over the measurements, is unbiased.
+log Σ w_i' p(y | x_i), whose exponential, multiplied over the measurements, is unbiased without a kernel.
 
-Regularised: after resampling each particle moves by a draw from a Gaussian kernel, h times the root of the cloud's
-covariance, with the bandwidth h that is best for a Gaussian cloud, times the option `bandwidth`. Optionally only
-particles that have a sibling move.
+Regularised: after resampling each particle x becomes m + √(1 - h²) (x - m) and a draw from a Gaussian kernel, h times
+the root of the cloud's covariance, so that the cloud keeps its mean m and covariance, which a kernel alone would widen
+by 1 + h² each time. The bandwidth h is the one that is best for a Gaussian cloud, times the option `bandwidth`, at most
+1. Optionally only particles that have a sibling move.
 
 Each particle has its own values of the considered states. A measurement weighs the particles with them, so that mean
 and covariance of the others account for their uncertainty; then `reconsider` gives them their prior again.
 
 Sources: Gordon, Salmond & Smith (1993), doi:10.1049/ip-f-2.1993.0015; Musso, Oudjane & Le Gland (2001), Improving
-regularised particle filters, in Sequential Monte Carlo Methods in Practice, doi:10.1007/978-1-4757-3437-9_12.
+regularised particle filters, in Sequential Monte Carlo Methods in Practice, doi:10.1007/978-1-4757-3437-9_12; West
+(1993), Mixture models, Monte Carlo, Bayesian updating and dynamic models, for the shrinkage.
 """
 
 from __future__ import annotations
@@ -24,7 +26,6 @@ import numpy as np
 from ..compiled.context import (
     circular_rows,
     circular_states,
-    estimated,
     expect_points,
     has_own_likelihood,
     own_likelihood,
@@ -35,7 +36,6 @@ from ..compiled.context import options as numbers
 from ..compiled.noise import add_noise, belief_root, has_correlated_rows, independent_rows, noise_root
 from ..compiled.verdict import LOG_2PI
 from ..estimator import POINTS, TRAJECTORIES, Estimator, Option, Options, SmoothingRule
-from ..gaussian.shared import admit
 from ..model.state_space import StateSpaceModel
 from ..numerics.jit import ints, jit
 from ..numerics.linalg import wrap
@@ -54,7 +54,6 @@ from .cloud import (
     OPTIONS,
     PROCESS,
     RESAMPLE,
-    SETTLED,
     SHARED,
     WIDTH,
     add_chunk,
@@ -71,11 +70,9 @@ from .cloud import (
     wrap_record,
 )
 from .draws import jump, jump_key, reconsider, recover, spread_by, start
-from .innovation import about, finite_rows, first_residual, half_square, predicted, score_rows
+from .innovation import about, expected_reading, finite_rows, first_residual, half_square
 from .weights import (
-    NO_KEY,
     OWN,
-    add_up,
     all_lost,
     block_of,
     keep_or_resample,
@@ -272,23 +269,36 @@ def weigh_block(context, u, dt, sensor, y, key, value, state, work, number):
 
 
 @jit
+def shrink(context, mean, records):
+    """x ← m + √(1 - h²) (x - m), but for its mode."""
+    h = numbers(context)[WIDTH]
+    circular = circular_states(context)
+    a = np.sqrt(1.0 - h * h)
+    for i in range(records.shape[0]):
+        for j in range(mean.size):
+            if j != context.mode:
+                d = records[i, j] - mean[j]
+                records[i, j] = mean[j] + a * (wrap(d) if circular[j] != 0 else d)
+
+
+@jit
 def smooth_block(context, u, dt, sensor, y, key, value, state, work, number):
-    """x ← x + L z: a draw from the kernel of the regularised filter."""
+    """x ← m + √(1 - h²) (x - m) + L z: a draw from the kernel of the regularised filter."""
     n = count_of(context)
     first, last = range_of(number, n)
-    shared, records = work_of(context, work), own_cloud(context, state).records
-    if numbers(context)[DUPLICATES] == 0.0:
-        spread_by(context, shared.L, key, first, records[first:last])
-        return
-    # Siblings stand side by side: runs of members that have one move.
+    shared, cloud = work_of(context, work), own_cloud(context, state)
+    records = cloud.records
+    every = numbers(context)[DUPLICATES] == 0.0
+    # Siblings stand side by side: runs of members that have one move, or the whole block.
     ancestors = shared.ancestors
     begin = first
     for i in range(first, last + 1):
         alone = i == last or not (
-            (i > 0 and ancestors[i - 1] == ancestors[i]) or (i + 1 < n and ancestors[i + 1] == ancestors[i])
+            every or (i > 0 and ancestors[i - 1] == ancestors[i]) or (i + 1 < n and ancestors[i + 1] == ancestors[i])
         )
         if alone:
             if i > begin:
+                shrink(context, cloud.mean, records[begin:i])
                 spread_by(context, shared.L, key, begin, records[begin:i])
             begin = i + 1
 
@@ -314,41 +324,42 @@ def update(context, u, sensor, y, index, state, work, innovation, innovation_std
     """
     if finite_rows(y, sensor_variances(context, sensor).size) == 0:
         return MISSING
-    shared, cloud = work_of(context, work), own_cloud(context, state)
-    settled = state[SETTLED]
-    index = next_draw(state)
     # log w_i + log p(y | x_i), and ν = y - Σ w h(x), S = Σ w (h(x) - ȳ)(h(x) - ȳ)ᵀ + R for the gate
-    sweep(WEIGH, context, u, 0.0, sensor, y, NO_KEY, 0.0, state, work)
-    add_up(context, work)
-    m = predicted(context, u, sensor, y, cloud.records[0], shared, innovation, innovation_std)
-    verdict = admit(context, sensor, m, shared.nu, shared.S, shared.U, score)
-    score_rows(context, sensor, y, shared, score)
-    state[SETTLED] = settled
+    index, verdict = expected_reading(WEIGH, context, u, sensor, y, state, work, innovation, innovation_std, score)
     # w_i ← w_i p(y | x_i) / Σ w p(y | x), and log p(y) = log Σ w p(y | x)
-    log_sum = normalise(context, state, work)
-    if verdict != GATED:
-        score[2] = log_sum
-    if verdict == USED and log_sum > -np.inf:
-        drawn = keep_or_resample(context, key_of(context.seed, index, RESAMPLE), log_sum, state, work)
-        if drawn and numbers(context)[WIDTH] > 0.0:
-            smooth(context, key_of(context.seed, index, JITTER), cloud.cov, shared.L, state, work)
-        reconsider(context, index, state)
-        score_cloud(state, score)
-    elif verdict == USED or verdict == FAILED:
-        verdict = FAILED
+    verdict = conclude(context, index, verdict, state, work, score)
+    if verdict == FAILED:
         recover(context, index, state)
-    if not score[2] > -np.inf:
-        score[2] = np.nan
     return verdict
 
 
 @jit
-def smooth(context, key, cov, L, state, work):
-    """Move each particle by a draw from the kernel, whose root L is h times that of the cloud's covariance."""
-    belief_root(cov, L)
-    for i in range(L.shape[0]):
-        for j in range(L.shape[0]):
-            L[i, j] *= numbers(context)[WIDTH] if i < estimated(context) else 0.0
+def conclude(context, index, verdict, state, work, score):
+    """Make the joint weights of a used measurement the state's; return the verdict, FAILED if none explains it.
+
+    The log-likelihood of a rejected measurement stays that of its Gaussian.
+    """
+    log_sum = normalise(context, state, work)
+    if verdict != GATED:
+        score[2] = log_sum if log_sum > -np.inf else np.nan
+    if verdict != USED:
+        return verdict
+    if not log_sum > -np.inf:
+        return FAILED
+    drawn = keep_or_resample(context, key_of(context.seed, index, RESAMPLE), log_sum, state, work)
+    if drawn and numbers(context)[WIDTH] > 0.0:
+        smooth(context, key_of(context.seed, index, JITTER), state, work)
+    reconsider(context, index, state)
+    score_cloud(state, score)
+    return USED
+
+
+@jit
+def smooth(context, key, state, work):
+    """Shrink the cloud and move each particle by a draw from the kernel, with the root L of h² times its covariance."""
+    L = work_of(context, work).L
+    belief_root(own_cloud(context, state).cov, L)
+    L *= numbers(context)[WIDTH]
     sweep(SMOOTH, context, state, 0.0, 0, state, key, 0.0, state, work)
 
 
@@ -363,13 +374,14 @@ JITTERED = Option.choice(
 def tune_regularised(options: Options, model: StateSpaceModel, tuning: Tuning) -> np.ndarray:
     """Return the numbers of the bootstrap filter, and the kernel width h.
 
-    h = bandwidth · (4 / (nx + 2))^(1/(nx+4)) · N^(-1/(nx+4)): Musso, Oudjane & Le Gland (2001), Gaussian kernel.
+    h = bandwidth · (4 / (nx + 2))^(1/(nx+4)) · N^(-1/(nx+4)), at most 1: Musso, Oudjane & Le Gland (2001), Gaussian
+    kernel.
     """
     nx = model.nx
     values = tune(options, model, tuning)
     power = 1.0 / (nx + 4)
     values[DUPLICATES] = options["jitter"]
-    values[WIDTH] = options["bandwidth"] * (4.0 / (nx + 2)) ** power * values[MEMBERS] ** -power
+    values[WIDTH] = min(options["bandwidth"] * (4.0 / (nx + 2)) ** power * values[MEMBERS] ** -power, 1.0)
     return values
 
 

@@ -15,16 +15,18 @@ from ..compiled.context import sensor_variances
 from ..compiled.noise import add_noise, independent_rows, semidefinite_root
 from ..estimator import Estimator
 from ..numerics.jit import inlined, jit
+from ..numerics.linalg import EPSILON
 from ..numerics.random import ONE, key_of, normal
-from ..track import FAILED, GATED, MISSING, USED
-from .cloud import DRAW, RESAMPLE, count_of, describe, own_cloud, own_covariance, score_cloud
-from .draws import reconsider, recover, start
-from .innovation import finite_rows
+from ..track import FAILED, MISSING, USED
+from .cloud import DRAW, count_of, describe, own_cloud, own_covariance
+from .draws import recover, start
+from .innovation import expected_reading, finite_rows
+from .pf import conclude
 from .proposals import (
+    EXPECT,
     PROPOSE,
     WAITING,
     expect_block,
-    expected_reading,
     look,
     move_block,
     place_draw,
@@ -32,7 +34,7 @@ from .proposals import (
     room_of,
     settle_draw,
 )
-from .weights import add_up, block_of, keep_or_resample, normalise, phases, range_of, sweep, work_of
+from .weights import add_up, block_of, phases, range_of, sweep, work_of
 
 
 @jit
@@ -64,6 +66,8 @@ def propose_block(context, u, dt, sensor, y, key, value, state, work, number):
         ratio = 0.0
         for a in range(nx):
             xi[a] = normal(key, place)
+            # A variance that rounds to zero would leave no density.
+            C[a, a] = max(C[a, a], np.sqrt(EPSILON))
             place += ONE
             ratio += 0.5 * xi[a] * xi[a] + np.log(C[a, a])
         add_noise(C, xi, z)
@@ -106,20 +110,13 @@ def update(context, u, sensor, y, index, state, work, innovation, innovation_std
     """
     if finite_rows(y, sensor_variances(context, sensor).size) == 0:
         return MISSING
-    index, verdict = expected_reading(context, u, sensor, y, state, work, innovation, innovation_std, score)
+    index, verdict = expected_reading(EXPECT, context, u, sensor, y, state, work, innovation, innovation_std, score)
     if verdict == USED:
         # x_i ~ q, log w_i + log p(y | x_i) p(x_i | x_i') / q(x_i)
         sweep(PROPOSE, context, u, 0.0, sensor, y, key_of(context.seed, index, DRAW), 0.0, state, work)
         add_up(context, work)
-    log_sum = normalise(context, state, work)
-    if verdict != GATED:
-        score[2] = log_sum if log_sum > -np.inf else np.nan
-    if verdict == USED and log_sum > -np.inf:
-        keep_or_resample(context, key_of(context.seed, index, RESAMPLE), log_sum, state, work)
-        reconsider(context, index, state)
-        score_cloud(state, score)
-    elif verdict == USED or verdict == FAILED:
-        verdict = FAILED
+    verdict = conclude(context, index, verdict, state, work, score)
+    if verdict == FAILED:
         recover(context, index, state)
     return verdict
 

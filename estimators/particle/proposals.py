@@ -21,18 +21,15 @@ from ..compiled.context import (
     transition,
 )
 from ..compiled.jacobians import scratch_size, sensor_jacobian, state_jacobian
-from ..compiled.noise import add_covariances, add_noise, has_correlated_rows, semidefinite_root
+from ..compiled.noise import add_covariances, add_noise, semidefinite_root
 from ..compiled.verdict import LOG_2PI
-from ..gaussian.shared import admit
 from ..numerics.jit import inlined, jit
 from ..numerics.linalg import cholesky, congruence, solve_transposed, wrap
-from ..numerics.normal_score import add_tail
 from ..numerics.random import key_of
 from ..numerics.workspace import declare_layout, take_vector
 from .cloud import (
     EQUAL,
     PROCESS,
-    SETTLED,
     SHARED,
     clear_sums,
     count_of,
@@ -40,12 +37,11 @@ from .cloud import (
     own_cloud,
     own_covariance,
     sized,
-    tails_of,
     wrap_record,
 )
 from .draws import jump, jump_key, recover
-from .innovation import about, first_residual, log_density, predicted, score_rows
-from .weights import NO_KEY, OWN, add_up, all_lost, block_of, members_own, range_of, sweep, work_of, work_sized
+from .innovation import add_gaussian, first_residual, log_density
+from .weights import OWN, all_lost, block_of, members_own, range_of, sweep, work_of, work_sized
 
 MOVE, EXPECT, PROPOSE = range(OWN, OWN + 3)
 """Phases: N(x, P) one step on; its prediction of the measurement; the filter's own draw."""
@@ -167,8 +163,7 @@ def look(context, sensor, u, y, x, P, L, H, HL, S, U, e, expected, scratch):
         S[m, m] += r[row]
         expected[m] = e[m]
         m += 1
-    if has_correlated_rows(context, sensor):
-        add_covariances(context, sensor, y, 1.0, S)
+    add_covariances(context, sensor, y, 1.0, S)
     if not cholesky(S, U, m):
         return np.nan
     solve_transposed(U, m, expected)
@@ -194,12 +189,9 @@ def expect_block(context, u, dt, sensor, y, key, value, state, work, number):
     first, last = range_of(number, n)
     r = sensor_variances(context, sensor)
     own = has_own_likelihood(context, sensor)
-    correlated = has_correlated_rows(context, sensor)
     equal = state[EQUAL] != 0.0
-    circular = circular_rows(context, sensor)
     reference = np.empty(r.size)
     first_residual(context, u, sensor, y, records[0, :nx], reference)
-    tails = tails_of(context, sums)
     clear_sums(sums)
     for i in range(first, last):
         x = records[i, :nx]
@@ -215,24 +207,8 @@ def expect_block(context, u, dt, sensor, y, key, value, state, work, number):
         if joint[i] > sums[2]:
             sums[2] = joint[i]
             sums[3] = i
-        if not sound:
-            continue
-        w = 1.0 if equal else np.exp(log_w[i])
-        sums[0] += w
-        m = 0
-        for row in range(r.size):
-            if np.isfinite(y[row]):
-                e[m] = about(e[m], reference[row], circular[row])
-                if not own:
-                    add_tail((reference[row] + e[m]) / np.sqrt(S[m, m]), w, tails[2 * m :])
-                S[m, m] -= r[row]
-                m += 1
-        if correlated:
-            add_covariances(context, sensor, y, -1.0, S)
-        for a in range(m):
-            sums[4 + a] += w * e[a]
-            for b in range(a + 1):
-                sums[4 + m + a * m + b] += w * (e[a] * e[b] + S[a, b])
+        if sound:
+            add_gaussian(context, sensor, y, 1.0 if equal else np.exp(log_w[i]), reference, e, S, sums)
 
 
 @inlined
@@ -262,22 +238,6 @@ def predict(context, u, dt, index, state, work):
     sweep(MOVE, context, u, dt, 0, u, key_of(context.seed, index, PROCESS), 0.0, state, work)
     if all_lost(context, state, work):
         recover(context, index, state)
-
-
-@jit
-def expected_reading(context, u, sensor, y, state, work, innovation, innovation_std, score):
-    """Fill the innovation and the scores from the particles' Gaussians; return index and verdict."""
-    shared, cloud = work_of(context, work), own_cloud(context, state)
-    settled = state[SETTLED]
-    index = next_draw(state)
-    sweep(EXPECT, context, u, 0.0, sensor, y, NO_KEY, 0.0, state, work)
-    add_up(context, work)
-    x = cloud.records[0, : context.nx]
-    m = predicted(context, u, sensor, y, x, shared, innovation, innovation_std)
-    state[SETTLED] = settled
-    verdict = admit(context, sensor, m, shared.nu, shared.S, shared.U, score)
-    score_rows(context, sensor, y, shared, score)
-    return index, verdict
 
 
 WAITING = {**SHARED, "state_size": sized(lambda nx: nx + nx * nx), "work_size": work_size}

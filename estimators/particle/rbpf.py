@@ -20,18 +20,16 @@ import numpy as np
 
 from ..compiled.context import circular_states, estimated, sensor_variances
 from ..estimator import Estimator, Option, Options
-from ..gaussian.shared import admit
 from ..model.state_space import StateSpaceModel
 from ..numerics.jit import floats, jit, matrix
 from ..numerics.linalg import copy
 from ..numerics.peaks import peaks_of
 from ..numerics.random import key_of, normal
-from ..track import FAILED, GATED, MISSING, USED
+from ..track import FAILED, MISSING, USED
 from .cloud import (
     MAX_POINTS,
     PROCESS,
     RECOVER,
-    RESAMPLE,
     SETTLED,
     SHARED,
     START,
@@ -41,7 +39,6 @@ from .cloud import (
     next_draw,
     own_cloud,
     own_covariance,
-    score_cloud,
     sized,
     views,
     weigh_equally,
@@ -49,8 +46,9 @@ from .cloud import (
     wrap_record,
 )
 from .cloud import OPTIONS as CLOUD_OPTIONS
-from .draws import any_mode, jump_key, lost_moments, nearest_mode, reconsider, reset
-from .innovation import finite_rows, score_rows
+from .draws import any_mode, jump_key, lost_moments, nearest_mode, reset
+from .innovation import expected_reading, finite_rows
+from .pf import conclude
 from .rbpf_blocks import (
     ADOPT,
     CONDITION,
@@ -59,14 +57,12 @@ from .rbpf_blocks import (
     condition_block,
     drop,
     fix_mode,
-    mixture,
     predict_block,
-    refer,
     sample,
     tune,
     work_size,
 )
-from .weights import NO_KEY, add_up, all_lost, keep_or_resample, normalise, phases, sweep, work_of
+from .weights import NO_KEY, all_lost, phases, sweep
 
 
 @jit
@@ -159,31 +155,14 @@ def update(context, u, sensor, y, index, state, work, innovation, innovation_std
     explains the measurement the verdict is `FAILED`, the measurement is not used, and the cloud is widened. An infinite
     measurement fails without widening.
     """
-    rows = sensor_variances(context, sensor).size
-    if finite_rows(y, rows) == 0:
+    if finite_rows(y, sensor_variances(context, sensor).size) == 0:
         return MISSING
-    shared = work_of(context, work)
-    settled = state[SETTLED]
-    index = next_draw(state)
-    refer(context, sensor, u, state, shared.nu[:rows])
     # Each particle's Kalman update, aside, and log w_i + log N(y; h(x_i), H P_i Hᵀ + R)
-    sweep(CONDITION, context, u, 0.0, sensor, y, NO_KEY, 0.0, state, work)
-    add_up(context, work)
-    m = mixture(context, sensor, y, shared, innovation, innovation_std)
-    verdict = admit(context, sensor, m, shared.nu, shared.S, shared.U, score)
-    score_rows(context, sensor, y, shared, score)
-    state[SETTLED] = settled
+    index, verdict = expected_reading(CONDITION, context, u, sensor, y, state, work, innovation, innovation_std, score)
     if verdict == USED:
         sweep(ADOPT, context, u, 0.0, sensor, y, NO_KEY, 0.0, state, work)
-    log_sum = normalise(context, state, work)
-    if verdict != GATED:
-        score[2] = log_sum if log_sum > -np.inf else np.nan
-    if verdict == USED and log_sum > -np.inf:
-        keep_or_resample(context, key_of(context.seed, index, RESAMPLE), log_sum, state, work)
-        reconsider(context, index, state)
-        score_cloud(state, score)
-    elif verdict == USED or (verdict == FAILED and not score[0] == np.inf):
-        verdict = FAILED
+    verdict = conclude(context, index, verdict, state, work, score)
+    if verdict == FAILED and not score[0] == np.inf:
         state[SETTLED] = 0.0
         _recover(context, index, state)
     return verdict

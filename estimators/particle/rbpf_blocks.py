@@ -29,7 +29,6 @@ from ..gaussian.shared import factor
 from ..model.state_space import StateSpaceModel
 from ..numerics.jit import jit, threaded
 from ..numerics.linalg import copy, solve_transposed, wrap
-from ..numerics.normal_score import add_tail
 from ..numerics.random import ONE, normal
 from ..numerics.workspace import declare_layout
 from ..tuning import Tuning
@@ -42,12 +41,11 @@ from .cloud import (
     members,
     own_cloud,
     own_covariance,
-    tails_of,
     wrap_record,
 )
 from .cloud import tune as tune_cloud
 from .draws import jump, jump_key
-from .innovation import about, finite_rows
+from .innovation import add_gaussian, first_residual
 from .weights import OWN, block_of, members_own, range_of, work_of, work_sized
 
 PREDICT, CONDITION, ADOPT = range(OWN, OWN + 3)
@@ -226,32 +224,17 @@ def predict_block(context, u, dt, sensor, y, key, value, state, work, number):
 
 
 @jit
-def refer(context, sensor, u, state, reference):
-    """Fill the expected measurement of the first particle for which it is finite: a reference to sum from."""
-    records = own_cloud(context, state).records
-    for i in range(records.shape[0]):
-        expect(context, sensor, records[i, : context.nx], u, reference)
-        finite = True
-        for k in range(reference.size):
-            finite &= np.isfinite(reference[k])
-        if finite:
-            return
-    reference[:] = 0.0
-
-
-@jit
 def condition_block(context, u, dt, sensor, y, key, value, state, work, number):
     """Condition a block's members on the measurement, aside: a Kalman update of each one's linear part.
 
-    x ← x + K e;  P ← P - K S Kᵀ;  joint = log w + log N(e; 0, S),  S = H P Hᵀ + R, over the finite rows. The sums get
-    the moments of the predicted measurement, about the reference, under the weights before it, and its two tails, row
-    by row; see `score_rows`.
+    x ← x + K e;  P ← P - K S Kᵀ;  joint = log w + log N(e; 0, S),  S = H P Hᵀ + R, over the finite rows. The sums are
+    those of `expect_block` in proposals.py.
     """
     nx, n = context.nx, count_of(context)
     shared, cloud = work_of(context, work), own_cloud(context, state)
     room, sums = room_of(context, shared, number), block_of(context, shared, number).sums
     B, S, U, e, expected = room.B, room.S, room.U, room.e, room.expected
-    joint, reference, after = shared.joint, shared.nu, posteriors_of(context, shared)
+    joint, after = shared.joint, posteriors_of(context, shared)
     records, log_w = cloud.records, cloud.log_w
     first, last = range_of(number, n)
     linear = linear_states(context)
@@ -260,8 +243,9 @@ def condition_block(context, u, dt, sensor, y, key, value, state, work, number):
     angles = circular_rows(context, sensor)
     circular = circular_states(context)
     equal = state[EQUAL] != 0.0
+    reference = np.empty(r.size)
+    first_residual(context, u, sensor, y, records[0, :nx], reference)
     clear_sums(sums)
-    tails = tails_of(context, sums)
     for i in range(first, last):
         joint[i] = -np.inf
         if not log_w[i] > -np.inf:
@@ -275,12 +259,11 @@ def condition_block(context, u, dt, sensor, y, key, value, state, work, number):
         for row in range(r.size):
             if not np.isfinite(y[row]):
                 continue
+            # Row `row` moves up to m ≤ row.
             e[m] = y[row] - expected[row]
-            # Row `row` moves up to m ≤ row: the deviation of ŷ from the reference.
-            expected[m] = expected[row] - reference[row]
             if angles[row] != 0:
                 e[m] = wrap(e[m])
-                expected[m] = wrap(expected[m])
+            expected[m] = e[m]
             for j in linear:
                 s = 0.0
                 for k in linear:
@@ -299,22 +282,12 @@ def condition_block(context, u, dt, sensor, y, key, value, state, work, number):
         add_covariances(context, sensor, y, 1.0, S)
         if not factor(S, U, m, nx):
             continue
-        w = 1.0 if equal else np.exp(log_w[i])
-        sums[0] += w
-        k = 0
-        for row in range(r.size):
-            if np.isfinite(y[row]):
-                z = about(y[row], reference[row], angles[row]) - expected[k] if angles[row] != 0 else e[k]
-                add_tail(z / np.sqrt(S[k, k]), w, tails[2 * k :])
-                k += 1
-        for a in range(m):
-            sums[4 + a] += w * expected[a]
-            for b in range(a + 1):
-                sums[4 + m + a * m + b] += w * (expected[a] * expected[b] + S[a, b])
         solve_transposed(U, m, e)
         density = log_w[i] - 0.5 * m * LOG_2PI
         for k in range(m):
             density -= 0.5 * e[k] * e[k] + np.log(U[k, k])
+        if density < np.inf:
+            add_gaussian(context, sensor, y, 1.0 if equal else np.exp(log_w[i]), reference, expected, S, sums)
         if not -np.inf < density < np.inf:
             continue
         joint[i] = density
@@ -352,35 +325,3 @@ def adopt_block(context, u, dt, sensor, y, key, value, state, work, number):
         if shared.joint[i] > -np.inf:
             for j in range(nx + nx * nx):
                 records[i, j] = posteriors[i, j]
-
-
-@jit
-def mixture(context, sensor, y, shared, innovation, innovation_std):
-    """Fill innovation and covariance of the mixture of the particles' predictions; ν holds the reference.
-
-    ν = y - Σ w ŷ,  S = Σ w (S_i + ŷ ŷᵀ) - (Σ w ŷ)(Σ w ŷ)ᵀ
-
-    Returns:
-        The number of finite rows.
-    """
-    sums, S, nu = shared.sums, shared.S, shared.nu
-    r = sensor_variances(context, sensor)
-    angles = circular_rows(context, sensor)
-    m = finite_rows(y, r.size)
-    k = 0
-    for row in range(r.size):
-        if not np.isfinite(y[row]):
-            continue
-        shift = sums[4 + k] / sums[0]
-        # Row `row` moves up to k ≤ row.
-        nu[k] = y[row] - nu[row] - shift
-        if angles[row] != 0:
-            nu[k] = wrap(nu[k])
-        for j in range(k + 1):
-            S[k, j] = sums[4 + m + k * m + j] / sums[0] - shift * sums[4 + j] / sums[0]
-            S[j, k] = S[k, j]
-        S[k, k] = max(S[k, k], r[row])
-        innovation[row] = nu[k]
-        innovation_std[row] = np.sqrt(S[k, k])
-        k += 1
-    return m

@@ -5,7 +5,8 @@ A trajectory that stands at x' after an event goes back to the particle xᵢ bef
     wᵢ p(x' | xᵢ) / Σⱼ wⱼ p(x' | xⱼ),     p(x' | x) = N(x'; f(x), Q)
 
 so the trajectories are draws from the smoothing distribution, whatever its shape. Where the model takes several steps
-between two events, they pass the clouds between these. Moments of K trajectories scatter by 1/√K.
+between two events, they pass the clouds between these. The kernel of `pf-reg` is no part of p: where it is wide
+beside Q, the particles it has moved go back to too few. Moments of K trajectories scatter by 1/√K.
 
 Source: Godsill, Doucet & West (2004), doi:10.1198/016214504000000151.
 """

@@ -331,7 +331,7 @@ def test_a_smoother_refuses_what_is_considered():
         *((name, {"particles": 40000.0}, 0.05) for name in ("apf", "pf-ekf")),
         ("pf", {"particles": 40000.0}, np.inf),
         ("rbpf", {"particles": 10000.0}, np.inf),
-        ("pf-reg", {"bandwidth": 0.1, "particles": 40000.0}, np.inf),
+        ("pf-reg", {"bandwidth": 2.0, "particles": 40000.0}, np.inf),
     ],
 )
 def test_members_have_the_moments_of_the_equations(estimator, options, share):
