@@ -9,7 +9,7 @@ from ..compiled.jacobians import scratch_size, sensor_jacobian, state_jacobian
 from ..estimator import TANGENT, Estimator, Options, SmoothingRule
 from ..model.state_space import StateSpaceModel
 from ..numerics.jit import by_address, embedded, inlined, part
-from ..numerics.linalg import congruence, mirror, multiply_transposed, solve_transposed
+from ..numerics.linalg import congruence, copy_vector, mirror, multiply_transposed, solve_transposed
 from ..numerics.simd import dot
 from ..numerics.simd_ir import LANES
 from ..numerics.simd_rows import multiply_rows
@@ -48,7 +48,10 @@ from .shared import (
 )
 
 ITERATIONS = OWN
-"""Position in the context's options: iterations of the update."""
+"""Position in the context's options: most iterations of the update."""
+
+SETTLED = 1e-10
+"""Size of the step, in deviations of the prediction, that ends the iterations."""
 
 Predicting, predicting = declare_layout(
     "Predicting",
@@ -70,6 +73,7 @@ Updating, updating = declare_layout(
     K="n, m",  # gain
     H="m, n",  # dh/dx
     N="n, n",  # scratch of the Joseph form
+    last="n",  # mean of the iteration before
     jacobian="scratch_size(n, m)",  # scratch of a Jacobian
 )
 
@@ -80,7 +84,7 @@ def work_size(options: Options, nx: int, ny: int) -> int:
 
 
 def tune(values: Options, model: StateSpaceModel, tuning: Tuning) -> np.ndarray:
-    """Return the shared options, and the number of iterations of the update: one but for iekf.py."""
+    """Return the shared options, and the most iterations of the update: one but for iekf.py."""
     return np.array([*shared_options(values), values.get("iterations", 1.0)])
 
 
@@ -157,18 +161,15 @@ def project_rows(P, H, C, S, W):
 
 
 @inlined
-def correct(context, m, own, x, P):
-    """x ← x + K ν;  P by the Joseph form, or as P - K S Kᵀ."""
+def narrow(context, m, own, P):
+    """P by the Joseph form, or as P - K S Kᵀ."""
     reading = own.reading
     C, chol_S = reading.C, reading.chol_S
     if options(context)[JOSEPH] != 0.0:
         gain(m, C, chol_S, estimated(context), own.K, reading.W)
-        move_mean(m, C, chol_S, reading.nu, estimated(context), x)
         joseph(m, reading.d, C, own.H, own.K, P, own.N, reading.W, reading.B)
     else:
-        move_mean(m, C, chol_S, reading.nu, estimated(context), x)
         downdate(m, C, chol_S, estimated(context), P, reading.W)
-    wrap_mean(context, x)
 
 
 @by_address
@@ -178,7 +179,8 @@ def update(context, u, sensor, y, index, state, work, innovation, innovation_std
     Diverges when h curves strongly within the spread of the prediction: P then shrinks faster than the error.
 
     With more iterations, xᵢ₊₁ = x̂ + Kᵢ (y - h(xᵢ) - Hᵢ (x̂ - xᵢ)), x₀ = x̂. Each starts from the prediction x̂ and its P,
-    so that the measurement counts once; NIS, gate and weight are those of the prediction, P that of the last H.
+    so that the measurement counts once; NIS, gate and weight are those of the prediction, P that of the last H. They
+    end with a step xᵢ₊₁ - xᵢ of at most `SETTLED` deviations of the prediction.
 
     Sources: Jazwinski (1970), chapter 8; Bell & Cathey (1993), doi:10.1109/9.250476, for iterations.
     """
@@ -189,8 +191,8 @@ def update(context, u, sensor, y, index, state, work, innovation, innovation_std
     iterations = int(options(context)[ITERATIONS])
     # N is needed for the Joseph form only, z for the weight at the prediction only.
     predicted, nu, nu_std = own.N[0], innovation, innovation_std
-    for i in range(x.size):
-        predicted[i] = x[i]
+    copy_vector(x, predicted)
+    copy_vector(x, own.last)
     verdict = USED
     m = np.int64(0)  # a literal would be a second type, and compile every callee twice
     for iteration in range(iterations):
@@ -206,11 +208,13 @@ def update(context, u, sensor, y, index, state, work, innovation, innovation_std
                 verdict = FAILED
         if verdict != USED:
             break
-        if iteration < iterations - 1:
-            move_mean(m, reading.C, reading.chol_S, reading.nu, estimated(context), x)
-            nu, nu_std = reading.z[: reading.r.size], reading.z[reading.r.size :]
+        move_mean(m, reading.C, reading.chol_S, reading.nu, estimated(context), x)
+        if iterations > 1 and has_settled(P, x, own.last):
+            break
+        nu, nu_std = reading.z[: reading.r.size], reading.z[reading.r.size :]
     if verdict == USED:
-        correct(context, m, own, x, P)
+        narrow(context, m, own, P)
+        wrap_mean(context, x)
         if is_adaptive(context):
             adapt(context, sensor, y, state, innovation, innovation_std, score)
     return verdict
@@ -222,8 +226,17 @@ def back_to(predicted, m, H, x, nu):
     for k in range(m):
         for j in range(x.size):
             nu[k] -= H[k, j] * (predicted[j] - x[j])
+    copy_vector(predicted, x)
+
+
+@inlined
+def has_settled(P, x, last):
+    """Return whether x is within `SETTLED` deviations of the prediction from `last`, which it replaces."""
+    near = True
     for j in range(x.size):
-        x[j] = predicted[j]
+        near &= abs(x[j] - last[j]) <= SETTLED * np.sqrt(P[j, j])
+    copy_vector(x, last)
+    return near
 
 
 EKF = Estimator(

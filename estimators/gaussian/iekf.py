@@ -1,7 +1,7 @@
-"""The iterated extended Kalman filter: the update is linearised again at its own result.
+"""The iterated extended Kalman filter: the update is linearised again at its own result until that converges.
 
 Each iteration is a Gauss-Newton step to the minimum of ½ |x - x̂|²_P⁻¹ + ½ |y - h(x)|²_R⁻¹. The update is that of ekf.py
-with `iterations`; that they suffice is not tested.
+with at most `iterations`, which may be too few.
 
 Source: Bell & Cathey (1993), doi:10.1109/9.250476.
 """
@@ -21,5 +21,5 @@ IEKF = replace(
     model_runs="1, and h once an iteration; each and its derivatives (nx by complex step)",
     fails_when="Gauss-Newton overshoots or two peaks fit; f's curvature makes it overconfident like the EKF",
     source="Bell & Cathey (1993), doi:10.1109/9.250476",
-    options=(Option("iterations", 3, 1, 100, "", "linearisations per measurement; 1 is the EKF"), *EKF.options),
+    options=(Option("iterations", 3, 1, 100, "", "most linearisations per measurement; 1 is the EKF"), *EKF.options),
 )

@@ -21,6 +21,8 @@ NAMES = ("pf", "pf-reg", "pf-ekf", "apf")
 EXACT = ("pf", "pf-ekf", "apf")
 """Those whose limit is the posterior itself; the kernel of pf-reg smooths it."""
 
+STILL = (Noise("s", "m²/s", 0.0),)
+
 
 @lru_cache
 def problem():
@@ -145,7 +147,7 @@ def test_noise_that_depends_on_the_state_is_each_particles_own(name):
 
 def test_the_kernel_keeps_mean_and_covariance():
     """Within four deviations of the moments of 1e5 draws."""
-    model = scalar(noises=(Noise("s", "m²/s", 0.0),))
+    model = scalar(noises=STILL)
     log = log_of(1, (0, READING, 2.3), (1, TICK, 0))
     tuning = Tuning.of(model).with_options({"particles": 1e5, "fraction": 1.0, "bandwidth": 2.0})
     run = folded("pf-reg", model, log, tuning)
@@ -215,16 +217,14 @@ def test_a_reading_without_a_value_and_a_question_change_nothing(name):
     """Nor how often the filter drew: what comes after it has its bits as before. It is the last of its time."""
     model = scalar()
     tuning = Tuning.of(model).with_options({"particles": 200})
-    plain = fold(name, model, tuning, log_of(1, (0, READING, 2.1), (1, READING, 2.4), (2, READING, 2.2)))
-    gaps = log_of(
-        1, (0, READING, 2.1), (1, READING, np.nan), (1, READING, 2.4), (2, READING, 2.2), (2, READING, np.nan)
-    )
-    missed = fold(name, model, tuning, gaps)
+    first, *others = (0, READING, 2.1), (1, READING, 2.4), (2, READING, 2.2)
+    plain = fold(name, model, tuning, log_of(1, first, *others))
+    missed = fold(name, model, tuning, log_of(1, first, (1, READING, np.nan), *others, (2, READING, np.nan)))
     assert list(missed.verdict) == [USED, USED, MISSING, USED, MISSING]
     assert np.array_equal(plain.mean[[0, 1, 1, 2, 2]], missed.mean)
     assert np.array_equal(plain.log_likelihood, missed.log_likelihood[[0, 1, 3]])
-    questions = (0, READING, 2.1), (0.5, TICK, 0), (0.9, TICK, 0), (1, READING, 2.4), (2, READING, 2.2)
-    assert np.array_equal(plain.mean, fold(name, model, tuning, log_of(1, *questions)).mean[[0, 3, 4]])
+    asked = fold(name, model, tuning, log_of(1, first, (0.5, TICK, 0), (0.9, TICK, 0), *others))
+    assert np.array_equal(plain.mean, asked.mean[[0, 3, 4]])
 
 
 @pytest.mark.parametrize(("key", "value", "verdict"), [("gate", 0.999, GATED), ("use.y", False, HELD_OUT)])
@@ -283,7 +283,7 @@ def test_particles_where_the_sensor_says_no_number_are_out(name):
 def test_copies_of_one_particle_widen_too():
     """No spread is left to double, nor process noise to bring it back; it takes the seed 23 doublings to reach 0.5."""
     sharp = Sensor("y", (Row("y", "m", 0.04),), h=first_state, log_likelihood=within_half)
-    model = scalar(sensors=(sharp,), noises=(Noise("s", "m²/s", 0.0),))
+    model = scalar(sensors=(sharp,), noises=STILL)
     log = log_of(1, *((0.01 * k, READING, 2.0 if k == 0 else 4.0) for k in range(60)))
     run = folded("pf", model, log, options={"particles": 20}, stop=1)
     block(run.options, run._now.state, 1)[:] = 2.0
@@ -321,11 +321,9 @@ def test_points_are_drawn_by_weight():
 @pytest.mark.parametrize("scheme", range(4))
 def test_siblings_stand_side_by_side(name, scheme):
     """Nothing moves but by resampling: each particle is a copy of one of the prior's, in the order of these."""
-    model = scalar(noises=(Noise("s", "m²/s", 0.0),))
-    tuning = Tuning.of(model).with_options({"particles": 3000, "resampling": scheme, "fraction": 1.0})
-    if name == "apf":
-        tuning = tuning.with_options({"particles": 3000, "resampling": scheme})
-    run = folded(name, model, log_of(1, (0, TICK, 0), (1, READING, 2.3)), tuning, stop=1)
+    model = scalar(noises=STILL)
+    options = {"particles": 3000, "resampling": scheme} | ({} if name == "apf" else {"fraction": 1.0})
+    run = folded(name, model, log_of(1, (0, TICK, 0), (1, READING, 2.3)), options=options, stop=1)
     before = block(run.options, run._now.state, 1)[:, 0].copy()
     run.advance()
     order = np.argsort(before)
@@ -337,7 +335,7 @@ def test_siblings_stand_side_by_side(name, scheme):
 
 def test_the_kernel_may_move_duplicates_only():
     """Without process noise a particle that has no sibling is a copy of one before; each of several is not."""
-    model = scalar(noises=(Noise("s", "m²/s", 0.0),))
+    model = scalar(noises=STILL)
     clouds = {}
     for name, options in (
         ("pf", {}), ("pf-reg", {"jitter": 1}), ("pf-reg", {"jitter": 0}), ("pf-reg", {"jitter": 1, "bandwidth": 0.0}),
