@@ -16,7 +16,6 @@ from typing import Any
 import numba
 import numpy as np
 
-from estimators.compiled.model import compile_model
 from estimators.fold import Fold
 from estimators.log import READING, Events, Log
 from estimators.model.state_space import Noise, Row, Sensor, State, StateSpaceModel
@@ -29,6 +28,7 @@ from estimators.tuning import Tuning
 from tests.models import first_state
 
 from ..support import SECOND
+from ..textbook import CHAOS, simulate
 from .timing import BenchmarkRow, Bound, both, compare
 
 STEPS = 20
@@ -150,23 +150,11 @@ def rao_blackwellised() -> Iterator[BenchmarkRow]:
         yield _cost(name, (500, 5_000, 50_000), GRIPPER_CONTACT, 20.0)
 
 
-def _truth(cycles: int) -> tuple[np.ndarray, np.ndarray]:
-    """States of Lorenz 96 on its attractor, and readings of them with R = I."""
-    f, rng = compile_model(LORENZ96).f, np.random.default_rng(1)
-    x, states = LORENZ96.prior_mean + rng.standard_normal(40), np.empty((cycles + 500, 40))
-    for k in range(len(states)):
-        f(x, np.zeros(0), np.array([8.0]), CYCLE_S, states[k])
-        x = states[k]
-    return states[-cycles - 1 :], states[-cycles:] + rng.standard_normal((cycles, 40))
-
-
 def _ensemble(name: str, options: dict[str, float]) -> Callable[[], None]:
-    truth, readings = _truth(CYCLES)
-    log = Log(LORENZ96.width, CYCLES)
-    t = (np.arange(CYCLES, dtype=np.int64) + 1) * round(CYCLE_S * 1e9)
-    log.extend(Events(t, t, np.full(CYCLES, READING, np.int8), np.zeros(CYCLES, np.int32), readings))
+    chaos = CHAOS["lorenz96"]
     tuning = Tuning.of(LORENZ96).with_options(options).set("Q.x", 0.0)
-    return _refolding(Fold(name, LORENZ96, tuning, log, base=Base(truth[0], 0.1 * np.eye(40), 0, np.zeros(0))))
+    base = Base(chaos.mean, chaos.variance * np.eye(40), 0, np.zeros(0))
+    return _refolding(Fold(name, LORENZ96, tuning, simulate(chaos, CYCLES, 1)[1], base=base))
 
 
 def beside_dapper() -> Iterator[BenchmarkRow]:

@@ -11,6 +11,7 @@ from estimators.diagnostics.innovations import jarque_bera, ljung_box
 from estimators.fold import fold
 from estimators.log import READING, Events
 from estimators.tuning import Tuning
+from tests.estimators.fit.test_plain import NILE_FLOW
 from tests.models import level_model
 from tests.support import SECOND, as_log
 
@@ -46,13 +47,9 @@ def theirs(series: np.ndarray):
     return model.filter([IRREGULAR, LEVEL])
 
 
-def nile() -> np.ndarray:
-    return sm.datasets.nile.load_pandas().data["volume"].to_numpy(float, copy=True)
-
-
 @pytest.fixture(scope="module", params=["whole", "with gaps"])
 def series(request):
-    flows = nile()
+    flows = NILE_FLOW.copy()
     if request.param == "with gaps":
         flows[GAPS] = np.nan
     return flows
@@ -65,19 +62,8 @@ def test_innovations_of_the_nile_are_those_of_statsmodels(series):
     np.testing.assert_allclose(np.nan_to_num(ours), expected, rtol=0, atol=AGREE)
 
 
-def test_diagnostics_of_the_nile_are_those_of_statsmodels():
-    results, ours = theirs(nile()), innovations_of(nile())
-    expected = results.test_serial_correlation("ljungbox")[0]
-    for lags in range(1, expected.shape[1] + 1):
-        got = ljung_box(ours, lags)
-        np.testing.assert_allclose(got[:2], expected[:, lags - 1], rtol=0, atol=AGREE)
-        assert got.dof == lags
-    assert ljung_box(ours) == got  # ten lags, as they choose
-    np.testing.assert_allclose(jarque_bera(ours)[:2], results.test_normality("jarquebera")[0][:2], rtol=0, atol=AGREE)
-
-
 def test_gaps_are_left_out_of_normality_as_statsmodels_does():
-    flows = nile()
+    flows = NILE_FLOW.copy()
     flows[GAPS] = np.nan
     ours = innovations_of(flows)
     expected = their_jarque_bera(ours[np.isfinite(ours)])[:2]

@@ -28,7 +28,7 @@ def smoothed(estimator, model, ys, **settings):
 
 def swing(x, u, p, dt, out):
     out[0] = x[0] + dt * x[1]
-    out[1] = x[1] - dt * 9.8 * np.sin(x[0])
+    out[1] = x[1] - dt * 9.81 * np.sin(x[0])
 
 
 def height(x, u, p, out):
