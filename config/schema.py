@@ -39,7 +39,7 @@ from .fields import (
 )
 from .model_schema import Model
 from .output_schema import AlertSection, OutputsSection
-from .source_schema import FaultSection, SourceSection
+from .source_schema import AssetSection, FaultSection, SourceSection
 
 PERCENT = r"^([0-9]+\.?[0-9]*|\.[0-9]+) ?%$"
 Percent = Annotated[str, Field(pattern=PERCENT)]
@@ -267,6 +267,10 @@ class GateSection(Section):
         return None if self.reopen == "never" else float(self.reopen)
 
 
+STALE_RATIO = 4.0
+"""Ratio of `stale_after` to a `degraded_after` that is longer than its default, where the YAML gives neither."""
+
+
 class TimeSection(Section):
     """Treatment of late and missing measurements."""
 
@@ -301,6 +305,11 @@ class TimeSection(Section):
             text = f"is {self.stale_after} s; it must not be below degraded_after ({self.degraded_after} s)"
             raise refused("relation", text, "stale_after")
         return self
+
+    def stale_from(self, degraded: float) -> float:
+        """Return `stale_after`; by default at least `STALE_RATIO` times a `degraded_after` that is longer than it."""
+        given = "stale_after" in self.model_fields_set or degraded <= self.stale_after
+        return self.stale_after if given else STALE_RATIO * degraded
 
 
 class MaintenanceSection(Section):
@@ -496,6 +505,14 @@ class TwinSection(Section):
     Default: {health: suspect} if there are receivers."""
     view: ViewSection = ViewSection()
     """Contents of the page."""
+
+    def sensor_period(self, name: str | None = None) -> float | None:
+        """Return the seconds between two measurements of a simulated sensor, or the slowest; None for other sources."""
+        asset = self.source if isinstance(self.source, AssetSection) else getattr(self.source, "asset", None)
+        if asset is None:
+            return None
+        plans = asset.sensors.values() if name is None else [asset.sensors[name]] if name in asset.sensors else []
+        return float(asset.step * max((plan.every for plan in plans), default=1))
 
 
 TwinSection.model_rebuild()  # on import, as several threads may need it first

@@ -9,7 +9,7 @@ import numpy as np
 from numpy.lib.stride_tricks import sliding_window_view
 
 from config.schema import ParameterSection, TwinSection, as_width
-from config.source_schema import AssetSection, SimulatorSection
+from config.source_schema import SimulatorSection
 from estimators.diagnostics.time_constants import MAX_STATES, jacobian, time_constants
 from estimators.errors import EstimatorError, ModelError
 from estimators.estimator import Estimator
@@ -31,21 +31,12 @@ MISSED_PERIODS = 3.0
 KEPT = 4
 """Intervals in succession that make a rate."""
 
-STALE_RATIO = 4.0
-"""Ratio of `stale_after` to a `degraded_after` that is longer than its default, where the YAML gives neither."""
-
 
 class DegradedAfter(NamedTuple):
     """Seconds without a reading after which the twin is degraded, and where they come from."""
 
     seconds: float
     reason: str
-
-
-def stale_after(config: TwinSection, degraded: float) -> float:
-    """Return the YAML's value; by default that of the schema, but at least four times a longer `degraded`."""
-    stale = config.time.stale_after
-    return stale if "stale_after" in config.time.model_fields_set or degraded <= stale else STALE_RATIO * degraded
 
 
 def degraded_after(
@@ -59,7 +50,7 @@ def degraded_after(
     if section.degraded_after is not None:
         return DegradedAfter(section.degraded_after, "time.degraded_after")
     slowest = _slowest(model)
-    period = sensor_period(config) or recorded()
+    period = config.sensor_period() or recorded()
     least = MIN_DEGRADED_S if period is None else max(MIN_DEGRADED_S, MISSED_PERIODS * period)
     if slowest is None:
         reason = "the model has no time constant (nothing in it decays), so "
@@ -112,16 +103,6 @@ def driven_states(model: StateSpaceModel) -> tuple[int, ...]:
             plain(model.f)(x[k], u, p, dt, moved[k])
         x[:] = moved
     return tuple(np.flatnonzero(x[0] != x[1]).tolist())
-
-
-def sensor_period(config: TwinSection, name: str | None = None) -> float | None:
-    """Return the seconds between two measurements of a simulated sensor, or of the slowest; None for other sources."""
-    source = config.source
-    asset = source if isinstance(source, AssetSection) else getattr(source, "asset", None)
-    if asset is None:
-        return None
-    plans = asset.sensors.values() if name is None else [asset.sensors[name]] if name in asset.sensors else []
-    return float(asset.step * max((plan.every for plan in plans), default=1))
 
 
 def bounds_of(config: TwinSection, model: StateSpaceModel) -> dict[str, tuple[float, float]]:

@@ -30,7 +30,7 @@ from estimators.models import MODELS
 from estimators.plausibility import DAY, surprise
 
 from .checks import check_named, check_names, one_each
-from .defaults import instrument_sections, parameter_sections, sensor_period
+from .defaults import instrument_sections, parameter_sections
 from .fmu import fmu_model
 from .landmarks import expanded
 from .learned import load_learned
@@ -479,7 +479,7 @@ def _of_row(values: tuple[Any, ...], k: int, default: Any) -> Any:
 
 def _too_long(limits: Limits, sensor: Sensor, config: TwinSection) -> str | None:
     """Return a window of duplicates that would make every measurement a copy; None if it does not."""
-    within, stale, period = limits.duplicates, config.time.stale_after, sensor_period(config, sensor.name)
+    within, stale, period = limits.duplicates, config.time.stale_after, config.sensor_period(sensor.name)
     what = f"duplicates.within is {within:g} s"
     if period is not None and within >= period:
         return f"{what}; it must be below the sensor's period ({period:g} s), or its next reading counts as a copy"

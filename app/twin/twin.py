@@ -30,7 +30,7 @@ from estimators.tuning import CHANGED_MARK, Tuning
 
 from ..ingest import Planned, UnknownInputs
 from .checks import check_named, check_outputs, check_refit, check_scene, commissioned
-from .defaults import DegradedAfter, Late, degraded_after, driven_states, late_policy, parameter_sections, stale_after
+from .defaults import DegradedAfter, Late, degraded_after, driven_states, late_policy, parameter_sections
 from .landmarks import expanded
 from .learned import correction_files
 from .model import configure, find_model, model_files
@@ -122,7 +122,7 @@ class Twin:
         """When the estimate may be trusted."""
         return HealthPolicy(
             degraded_after=self.degraded.seconds,
-            stale_after=stale_after(self.config, self.degraded.seconds),
+            stale_after=self.config.time.stale_from(self.degraded.seconds),
             diverged_nis=lost_from(commissioned(self.loaded, self.model)),
         )
 
