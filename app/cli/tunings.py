@@ -69,12 +69,11 @@ def _save(arguments: Arguments, name: str) -> None:
 
 
 def _accept(arguments: Arguments, name: str) -> None:
-    twin = load_twin(arguments.twin, overrides={"tuning": name})
-    if twin.version is None:
+    version = load_twin(arguments.twin, overrides={"tuning": name}).version
+    if version is None:
         raise ConfigError(f"--accept {OWN_VALUES}: the twin's own file applies until a version is accepted")
-    accept(twin.version, printable(arguments.note))
-    path = twin.version.path
-    _print(arguments, f"{shown_path(path)}: accepted", name=name, accepted=str(path))
+    accept(version, printable(arguments.note))
+    _print(arguments, f"{shown_path(version.path)}: accepted", name=name, accepted=str(version.path))
 
 
 def _apply(arguments: Arguments, name: str) -> None:

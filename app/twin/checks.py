@@ -8,6 +8,7 @@ from typing import Any
 from config.fleet_schema import FleetAlertSection, FleetOutputsSection
 from config.loader import Loaded
 from config.output_schema import AlertSection, OutputsSection
+from config.schema import PriorSection, SensorSection
 from config.yaml_files import Key
 from estimators.diagnostics.detectors import ALARM_NAMES, CAUSES
 from estimators.diagnostics.episodes.baseline import Normal
@@ -67,17 +68,11 @@ def check_stated(loaded: Loaded, model: StateSpaceModel, source: str) -> None:
         ConfigError: With file and line.
     """
     config = loaded.config
-    for state in model.states:
-        prior = config.prior.get(state.name)
-        if prior is None or prior.std is None:
-            raise loaded.error(
-                ("prior",), f"has no std of {state.name}, and {source} has none; give {state.name}: {{std}}"
-            )
-    for sensor in model.sensors:
-        section = config.sensors.get(sensor.name)
-        if section is None or section.variances is None:
-            text = f"has no std of {sensor.name}, and {source} has none; give {sensor.name}: {{std}}"
-            raise loaded.error(("sensors",), text)
+    prior, sensors = PriorSection(), SensorSection()
+    lacking = [("prior", name) for name in model.state_names if config.prior.get(name, prior).std is None]
+    lacking += [("sensors", name) for name in model.sensor_names if config.sensors.get(name, sensors).variances is None]
+    for key, name in lacking:
+        raise loaded.error((key,), f"has no std of {name}, and {source} has none; give {name}: {{std}}")
     if not config.noise:
         example = model.state_names[-1]
         raise loaded.error(("noise",), f"is missing, and {source} has none; give for example {example}: {{std}}")

@@ -17,6 +17,7 @@ from estimators.diagnostics.episodes.baseline import Normal, baseline_of, lost_f
 from estimators.errors import ConfigError
 from estimators.fold import fold
 from estimators.track import DIVERGED
+from tests.cases import cases
 
 TWIN = """\
 # A drive.
@@ -119,17 +120,7 @@ def test_a_file_that_cannot_be_written_is_one_line(tmp_path):
         write_section(tmp_path / "absent.yaml", "commissioned", "commissioned: {}\n")
 
 
-@pytest.mark.parametrize(
-    ("section", "said"),
-    [
-        ("  tooth: {bias: 0, scale: 1, correlation: 0}\n",
-            "drive.yaml:10: commissioned.tooth is no sensor row of motor_winding; choose from winding"),
-        ("  winding:\n    reached:\n      broken: 2\n",
-            "drive.yaml:12: commissioned.winding.reached.broken is no alarm of motor_winding; choose from narrow, "),
-        ("  winding: {scale: 0}\n", "drive.yaml:10: commissioned.winding.scale"),
-        ("  winding: {correlation: 1}\n", "drive.yaml:10: commissioned.winding.correlation"),
-    ],
-)  # fmt: skip
+@cases(__file__, "wrong_baselines.csv")
 def test_a_wrong_section_is_one_line(tmp_path, section, said):
     path = drive(tmp_path, TWIN + "commissioned:\n" + section)
     with pytest.raises(ConfigError) as problem:
