@@ -30,6 +30,8 @@ ROOT_CAUSE_PERIOD_S = 1.0
 MIN_EPISODE_S = 3.0
 """Duration of an episode from which its cause can be isolated."""
 
+MIN_MOVED = 0.1  # Standard deviations by which an error of a sensor moves a state that it affects
+
 LEVELS_PERIOD_S = 15.0
 """Seconds between two looks for new events."""
 
@@ -52,12 +54,17 @@ class RootCause:
         episodes: Returns the present episodes.
         take: Returns a copy of the last events, or None where there is none.
         notices: Receives a finding, once.
+        levels: Has the states that each sensor does not affect.
     """
 
     def __init__(
-        self, episodes: Callable[[], Sequence[Episode]], take: Callable[[], EventWindow | None], notices: Notices
+        self,
+        episodes: Callable[[], Sequence[Episode]],
+        take: Callable[[], EventWindow | None],
+        notices: Notices,
+        levels: ProtectionMonitor,
     ) -> None:
-        self._episodes, self._take, self._notices = episodes, take, notices
+        self._episodes, self._take, self._notices, self._levels = episodes, take, notices, levels
         self._found: dict[str, _Isolated] = {}
 
     def fault_behind(self, episode: Episode) -> str:
@@ -65,9 +72,10 @@ class RootCause:
         return self._found[episode.subject].words if _is_open(episode) and episode.subject in self._found else ""
 
     def with_fault(self, episode: Episode) -> Episode:
-        """Return the episode with the most likely fault in its text."""
-        words = self.fault_behind(episode)
-        return episode._replace(text=f"{episode.text}; most likely fault: {words}") if words else episode
+        """Return the episode with the most likely fault and, while it lasts, the states not affected, in its text."""
+        words, unaffected = self.fault_behind(episode), self._levels.unaffected.get(episode.subject)
+        text = f"{episode.text}; most likely fault: {words}" if words else episode.text
+        return episode._replace(text=f"{text}; not affected: {unaffected}" if unaffected and not episode.end else text)
 
     def primary(self, episode: Episode) -> Episode:
         """Return the open episode of the sensor that is most likely faulty in this one; this one if it is its own.
@@ -126,6 +134,9 @@ class ProtectionMonitor:
             false_alarm: Mean time between false alarms of the detectors, s.
         """
         self._take, self._false_alarm = take, false_alarm
+        self.unaffected: dict[str, str] = {}
+        """States that errors of each sensor row do not affect: a lasting one of its σ moves them by less than
+        `MIN_MOVED` of theirs."""
         self._latest: ProtectionLevels | None = None
         self._due = 0.0
 
@@ -164,6 +175,15 @@ class ProtectionMonitor:
             raise
         except Exception as error:  # noqa: BLE001  a user's model may raise anything; the status shows the reason
             return ProtectionLevels(taken.revision, taken.end, f"{type(error).__name__}: {error}")
+        self.unaffected = {
+            fault.nudge.name: ", ".join(
+                state.name
+                for state, moved, std in zip(model.shown_states, fault.response.states[-1], found.std[-1], strict=True)
+                if state.watched and abs(moved) * fault.nudge.scale < MIN_MOVED * std
+            )
+            for fault in found.faults
+            if fault.nudge.kind == SENSOR
+        }
         return ProtectionLevels(taken.revision, taken.end, found.reason, bounds_of(model, found), smallest_of(found))
 
 

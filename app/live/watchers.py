@@ -43,7 +43,9 @@ class Watchers:
         self.alerts = Alerts(notices, lambda: self.episode_log.summary.in_alarm)
         self.silence = SilentSource(notices, section.stale_after)
         self.integrity = ProtectionMonitor(engine.last_events, engine.policy.false_alarm_every)
-        self.root_cause = RootCause(lambda: self.episode_log.summary.episodes, engine.last_events, notices)
+        self.root_cause = RootCause(
+            lambda: self.episode_log.summary.episodes, engine.last_events, notices, self.integrity
+        )
 
     def start(self) -> None:
         """Begin to monitor."""

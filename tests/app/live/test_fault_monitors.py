@@ -54,6 +54,10 @@ def test_the_status_shows_the_sensitivity_of_the_same_events():
     computed = sensitivity(name, MODEL, tuning, log, false_alarm=engine.policy.false_alarm_every)
     assert found.reason == "" and found.t == int(log.t[log.n - 1])
     assert_close(found.bounds, bounds_of(MODEL, computed), 1e-12)
+    lasting = Episode(60.0, None, "winding", "spiky", 5.0, 1.0, 9.0, "%", "winding has spikes")
+    told = [engine._watchers.root_cause.with_fault(lasting._replace(end=end)).text for end in (None, 70.0)]
+    # A constant offset of the only sensor is one of the temperature, and none of its rate.
+    assert told == ["winding has spikes; not affected: rate", "winding has spikes"]
     # Of the one sensor's noise of 2 °C.
     (smallest,) = found.smallest
     size = float(computed.faults[0].visible)
@@ -148,7 +152,7 @@ def drive():
 
 def root_cause_of(fold, known):
     notices = Notices(lambda: 0)
-    return RootCause(lambda: known, lambda: event_window(fold, 0, 4000), notices), notices
+    return RootCause(lambda: known, lambda: event_window(fold, 0, 4000), notices, monitor(fold)), notices
 
 
 def shifted_yoke(fold):
@@ -186,12 +190,12 @@ def test_what_is_over_or_no_riddle_is_left_alone(drive):
     stuck = Episode(60.0, None, "tooth", "stuck", 41.0, np.nan, np.nan, "°C", "tooth is stuck")
     cause, notices = root_cause_of(drive, [over, stuck])
     cause.update(Job("test"))
-    assert not notices.since(0) and cause.with_fault(over) is over and cause.with_fault(stuck) is stuck
+    assert not notices.since(0) and [cause.with_fault(over), cause.with_fault(stuck)] == [over, stuck]
 
 
 def test_an_episode_older_than_the_window_is_not_guessed(drive):
     old = Episode(60.0, None, "yoke", "shifted", 1.0, 0.5, 1.5, "σ", "yoke reads high")
     late = event_window(drive, 0, 4000)._replace(base=drive.base_at(0)[1]._replace(clock=70 * 10**9))
-    cause = RootCause(lambda: [old], lambda: late, Notices(lambda: 0))
+    cause = RootCause(lambda: [old], lambda: late, Notices(lambda: 0), monitor(drive))
     cause.update(Job("test"))
     assert cause.fault_behind(old) == ""
