@@ -24,6 +24,15 @@ MERGE = "<<"  # Key whose value is a mapping, or a list of these, with defaults 
 MAX_VALUES = 100_000  # A twin has a few hundred values; nested aliases could otherwise ask for billions
 
 
+def rounded(value: Any, digits: int = 4) -> Any:
+    """Return a number, or a list or mapping of them, to so many significant digits."""
+    if isinstance(value, dict):
+        return {key: rounded(item, digits) for key, item in value.items()}
+    if isinstance(value, list):
+        return [rounded(item, digits) for item in value]
+    return float(f"{value:.{digits}g}")
+
+
 class _Loader(yaml.SafeLoader):
     """YAML 1.2's plain scalars: `on` and `no` are text, 1e-3 is a number, 010 is ten."""
 

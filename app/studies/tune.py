@@ -310,8 +310,7 @@ def next_step(twin: Twin, fitted: Fitted, aim: str) -> str:
             "fit fewer entries (--fit scale is one factor for Q and R), or give a longer or livelier recording with "
             "--log; the values of the twin stay."
         )
-    if any(line.edge and line.told for line in fitted.lines):
-        edges = ", ".join(line.key for line in fitted.lines if line.edge and line.told)
+    if edges := ", ".join(line.key for line in fitted.lines if line.edge and line.told):
         return f"widen the bounds of {edges} if that is physically possible, or look for a missing state."
     if not verdict.harmless:
         return (

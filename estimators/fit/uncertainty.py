@@ -18,6 +18,9 @@ batch, and its own fit explains that away; so J is taken as no less than its mea
 With the prior N(0, D²), that of the data sheet, the covariance is (G J⁻¹ G + D⁻²)⁻¹: directions that the data do not
 determine keep their prior width. If p is not the minimum, the step to it, d = (G / τ + D⁻²)⁻¹ Σ s_t / τ, adds d dᵀ.
 
+That is the accuracy of common values. Of K recordings of one specimen each, with steps d_k and variances C_k of their
+own, the variance between specimens is (D² + Σ (d_k - d̄)² + (1 - 1/K) Σ C_k) / K, with D² as one of them: D² for K = 1.
+
 The profile likelihood of entry i, 2 (l(θ̂) - max over all others of l(θ_i = t)) = z², has one solution on either side,
 or none where the data do not identify the entry; then the interval ends at the range. The signed root of the left side
 is nearly linear in t, so a few secant steps find it.
@@ -166,13 +169,10 @@ def _inverse(H: np.ndarray) -> np.ndarray | None:
 
 def _widened(cov: np.ndarray, scores: np.ndarray, precision: np.ndarray) -> np.ndarray:
     """Return the factor by which deviations of H⁻¹ J H⁻¹ exceed those of H⁻¹, (k,)."""
-    scored = np.flatnonzero(np.any(scores != 0.0, axis=0))
-    if scored.size < 2 * SCORE_BATCHES:
+    sums = _batched(scores.T, SCORE_BATCHES)
+    if len(sums) < SCORE_BATCHES:
         return np.ones(len(cov))
-    edges = np.linspace(0, scored.size, SCORE_BATCHES, endpoint=False).astype(int)
-    sums = np.add.reduceat(scores[:, scored], edges, axis=1)
-    sums -= sums.mean(axis=1, keepdims=True)
-    J = sums @ sums.T * SCORE_BATCHES / (SCORE_BATCHES - 1.0) + np.diag(precision)
+    J = sums.T @ sums * SCORE_BATCHES / (SCORE_BATCHES - 1.0) + np.diag(precision)
     robust = cov @ J @ cov
     return np.sqrt(np.maximum(1.0, np.diag(robust) / np.diag(cov)))
 
@@ -255,7 +255,8 @@ class ParameterWidths(NamedTuple):
 
     `std` (k,) and `correlation` (k, k) are those of the parameters `names`, in their units; `prior` (k,) their
     deviations without data; `inflation` the factor τ by which correlated errors discount the information. `envelope`
-    has the range of each input and shown state over the fitted events.
+    has the range of each input and shown state over the fitted events. `spread` (k,) are the deviations between
+    specimens, of which each recording counts as another.
     """
 
     names: tuple[str, ...]
@@ -264,6 +265,7 @@ class ParameterWidths(NamedTuple):
     prior: np.ndarray
     inflation: float
     envelope: Mapping[str, tuple[float, float]]
+    spread: np.ndarray
 
 
 def parameter_widths(
@@ -316,12 +318,20 @@ def parameter_widths(
         for name, (low, high) in ranges.items():
             least, most = envelope.get(name, (np.inf, -np.inf))
             envelope[name] = min(least, low), max(most, high)
-    G, information, score, inflation = _godambe(values, slopes)
-    cov = np.linalg.inv(information + np.eye(len(names)))
-    step = np.linalg.solve(G / inflation + np.eye(len(names)), score / inflation)
+    cov, step, inflation = _posterior(values, slopes)
     cov = D[:, None] * (cov + np.outer(step, step)) * D
     std = np.sqrt(np.diag(cov))
-    return ParameterWidths(names, std, cov / np.outer(std, std), D, inflation, envelope)
+    each, K = [_posterior([z], [Z]) for z, Z in zip(values, slopes, strict=True)], len(values)
+    between, within = np.var([d for _, d, _ in each], axis=0), np.mean([np.diag(C) for C, *_ in each], axis=0)
+    spread = D * np.sqrt(1 / K + between + (1 - 1 / K) * within)
+    return ParameterWidths(names, std, _scaled(cov), D, inflation, envelope, spread)
+
+
+def _posterior(values: Sequence[np.ndarray], slopes: Sequence[np.ndarray]) -> tuple[np.ndarray, np.ndarray, float]:
+    """Return the covariance (k, k) and the step to the minimum (k,) with the prior, in its units, and τ."""
+    G, information, score, inflation = _godambe(values, slopes)
+    unit = np.eye(score.size)
+    return np.linalg.inv(information + unit), np.linalg.solve(G / inflation + unit, score / inflation), inflation
 
 
 def _residuals_at(
@@ -413,7 +423,7 @@ def _godambe(
 
 
 def _batched(scores: np.ndarray, batches: int) -> np.ndarray:
-    """Return sums of scores (n, k) over batches of time, less their mean, (batches, k)."""
+    """Return sums of scores (n, k) over batches of time, less their mean, (batches, k); one of zeros if n is small."""
     scored = scores[np.any(scores != 0.0, axis=1)]
     if len(scored) < 2 * batches:
         return np.zeros((1, scores.shape[1]))

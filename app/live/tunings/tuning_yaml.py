@@ -3,13 +3,13 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 from config.schema import TwinSection
-from config.yaml_files import Key, as_flow, as_section, parse, with_section, with_values
+from config.yaml_files import Key, as_flow, as_section, parse, rounded, with_section, with_values
 from estimators.errors import LARGEST
 from estimators.estimator import Estimator
 from estimators.model.coloured import disturbance_time, error_time, errors_of
@@ -43,8 +43,9 @@ def tuning_yaml(
         prior: Mean (nx,) and covariance (nx, nx), diagonal, if they are not the file's; adds a section `prior`.
         whole: Whether other content of these sections (limits of a sensor, options of other filters) is kept, without
             its comments. If not, they have the tuned entries only, with every parameter.
-        widths: Covariance that a fit gives the parameters, and the range of its data, which become the range of
-            validity of what has one, or widens a parameter.
+        widths: Covariance that a fit gives the parameters, but with `whole` the spread between specimens of those that
+            have a `std`; and the range of its data, which becomes the range of validity of what has one, or widens a
+            parameter.
     """
     entry, first = find_entry(estimator), config.estimator
     options = {name: _option(entry, name, value) for name, value in tuning.options.items()}
@@ -67,7 +68,7 @@ def tuning_yaml(
     for name, value in (turned if whole else values).items():
         parameters[name] = {**parameters.get(name, {}), "value": value}
     if widths is not None:
-        parameters = _with_widths(parameters, widths)
+        _add_widths(parameters, widths, with_spread(config, model, widths) if whole else [])
     parameters = {name: item["value"] if list(item) == ["value"] else item for name, item in parameters.items()}
     lines += as_section("parameters", {name: item for name, item in parameters.items() if name not in times})
     if widths is not None or not whole:
@@ -96,16 +97,24 @@ CORRELATION_DIGITS = 8
 """A direction that the data determine well has a small share of each deviation: few digits would blur it."""
 
 
-def _with_widths(parameters: Mapping[str, Any], widths: ParameterWidths) -> dict[str, Any]:
-    """Return the section `parameters` with the widths of a fit."""
-    found = {name: dict(item) for name, item in parameters.items()}
+def with_spread(config: TwinSection, model: StateSpaceModel, widths: ParameterWidths) -> list[str]:
+    """Return the parameters of a fit whose `std` in a twin's file is the spread between specimens."""
+    sections = parameter_sections(model, config)
+    return [name for name in widths.names if name in sections and sections[name].std is not None]
+
+
+def _add_widths(parameters: dict[str, Any], widths: ParameterWidths, spread: Sequence[str]) -> None:
+    """Add the widths of a fit to the section `parameters`: for those of `spread` that between specimens."""
     for i, name in enumerate(widths.names):
-        pairs = zip(widths.names[:i], widths.correlation[i, :i].tolist(), strict=True)
-        own = found.setdefault(name, {})
-        own |= {"std": float(f"{widths.std[i]:.4g}")}
-        if i > 0:
-            own["correlation"] = {other: float(f"{value:.{CORRELATION_DIGITS}g}") for other, value in pairs}
-    return found
+        own = parameters.setdefault(name, {})
+        if name in spread:
+            # One specimen leaves it as the file has it, perhaps in percent.
+            own |= {"std": rounded(widths.spread[i])} if widths.spread[i] != widths.prior[i] else {}
+            continue
+        own["std"] = rounded(widths.std[i])
+        pairs = {other: widths.correlation[i, k] for k, other in enumerate(widths.names[:i]) if other not in spread}
+        if pairs:
+            own["correlation"] = rounded(pairs, CORRELATION_DIGITS)
 
 
 def _fitted_ranges(
@@ -121,7 +130,7 @@ def _fitted_ranges(
     limited |= {place for section in parameter_sections(model, config).values() for place in section.widen}
     for name in sorted(limited & set(widths.envelope)):
         low, high = widths.envelope[name]
-        found[name] = {"min": float(f"{low:.4g}"), "max": float(f"{high:.4g}")}
+        found[name] = rounded({"min": low, "max": high})
     return found
 
 
@@ -209,8 +218,7 @@ def _placed(data: Any, key: Key, value: Any) -> tuple[Key, Any]:
     for name in key:
         if name == "variance" and isinstance(data, Mapping) and "variance" not in data and "std" in data:
             name = "std"
-            roots = np.sqrt(value).tolist()
-            value = [float(f"{root:.6g}") for root in roots] if isinstance(roots, list) else float(f"{roots:.6g}")
+            value = rounded(np.sqrt(value).tolist(), 6)
         found.append(name)
         data = data.get(name) if isinstance(data, Mapping) else None
     if isinstance(data, Mapping) and "value" in data:

@@ -13,7 +13,7 @@ import numpy as np
 from config.companion_schema import AcceptedSection, EvidenceSection, MovedSection, VersionSection
 from config.loader import moved
 from config.tunings import OWN_VALUES, Version, check_name, folders, load_version, version_files, version_of
-from config.yaml_files import as_section, rewrite, shown_path, with_section, writing
+from config.yaml_files import as_section, rewrite, rounded, shown_path, with_section, writing
 from estimators.diagnostics.score import Score
 from estimators.errors import LARGEST, ConfigError
 from estimators.registry import find_estimator
@@ -22,7 +22,7 @@ from estimators.tuning import Tuning
 from ...twin.twin import Twin, with_version
 from ..changes import obstacle
 from ..running_fold import Running
-from .tuning_yaml import tuning_yaml, with_tuning
+from .tuning_yaml import tuning_yaml, with_spread, with_tuning
 
 if TYPE_CHECKING:
     from estimators.fit.fit import Fitted
@@ -128,7 +128,7 @@ def version_text(twin: Twin, given: Settings) -> str:
         saved=now(),
         note=given.note,
         fitted_on=tuple(given.fitted_on),
-        scores={name: float(f"{value:.{DIGITS}g}") for name, value in given.scores.items()},
+        scores=rounded(dict(given.scores), DIGITS),
         evidence=given.evidence,
     )
     heading = f"# A tuning version of {twin.name}; `nisus tunings` lists, compares and accepts them.\n"
@@ -184,8 +184,7 @@ def apply_tuning(
 ) -> str:
     """Write a tuning into the YAML of a twin, or into the copy `out`; return what was written, in words.
 
-    The twin is as its file has it. `prior` (mean and covariance) and `widths` (covariance of the parameters) are those
-    of a fit.
+    The twin is as its file has it. `prior` (mean and covariance) and `widths` (of the parameters) are those of a fit.
 
     Raises:
         ConfigError: If it cannot be written.
@@ -195,6 +194,9 @@ def apply_tuning(
     path = twin.path
     kept = rewrite(path, lambda text: moved(with_tuning(text, before, after), path, out or path), out)
     words = f"{shown_path(out or twin.path)}: has the values"
+    if widths is not None and (spread := with_spread(twin.config, tuning.model, widths)):
+        several = not np.array_equal(widths.spread, widths.prior)
+        words += f"; std of {', '.join(spread)} {'between the logs' if several else 'as before: one log, one specimen'}"
     return words if kept is None else f"{words}; the previous file is {shown_path(kept)}"
 
 
@@ -242,7 +244,7 @@ def settings_of(twin: Twin, found: Fitted, fitted_on: Sequence[str], note: str =
     tuning, prior = found.setting
     return Settings(
         found.estimator,
-        tuning,
+        found.setting.tuning,
         note,
         tuple(fitted_on),
         _scores(found.after.held_out),
@@ -261,7 +263,7 @@ def _evidence(found: Fitted) -> EvidenceSection:
     from estimators.fit.dual import shift
 
     def digits(value: float) -> float | None:
-        return float(f"{value:.4g}") if np.isfinite(value) and abs(value) <= LARGEST else None
+        return rounded(value) if np.isfinite(value) and abs(value) <= LARGEST else None
 
     entries = {
         line.key: MovedSection(
@@ -274,6 +276,6 @@ def _evidence(found: Fitted) -> EvidenceSection:
         for line in found.lines
         if not line.alone
     }
-    before = {name: float(f"{value:.{DIGITS}g}") for name, value in _scores(found.before.held_out).items()}
+    before = rounded(_scores(found.before.held_out), DIGITS)
     gain, error = digits(found.verdict.gain) or 0.0, digits(found.verdict.error) or 0.0
     return EvidenceSection(gain=gain, error=error, before=before, entries=entries)

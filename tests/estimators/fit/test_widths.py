@@ -37,7 +37,7 @@ MODEL = StateSpaceModel(
 )
 
 
-def recorded(phi, seed=0, hidden=False, drive=None):
+def recorded(phi, seed=0, hidden=False, drive=None, gain=2.0):
     """Return a log whose measurement errors have the lag-1 correlation phi, and the drive (N,)."""
     rng = np.random.default_rng(seed)
     error = np.empty(N)
@@ -45,7 +45,7 @@ def recorded(phi, seed=0, hidden=False, drive=None):
     for k in range(1, N):
         error[k] = phi * error[k - 1] + rng.normal(0.0, STD * np.sqrt(1.0 - phi**2))
     u = np.sin(np.arange(N) / 60.0) + 0.3 if drive is None else drive
-    y = 2.0 * u + error
+    y = gain * u + error
     true = 1.0 + rng.normal(0.0, 0.1, N)
     log = Log(MODEL.width)
     for k in range(N):
@@ -60,9 +60,9 @@ def recorded(phi, seed=0, hidden=False, drive=None):
     return log, u, y
 
 
-def widths(log, gain, aim=None):
+def widths(logs, gain, aim=None):
     setting = Setting(Tuning.of(MODEL).set("p.gain", gain), None)
-    return parameter_widths("ekf", setting, [Recording(log)], PRIOR, aim=aim)
+    return parameter_widths("ekf", setting, [Recording(log) for log in np.atleast_1d(logs)], PRIOR, aim=aim)
 
 
 # The minimum has the variance (uᵀ u)⁻¹ uᵀ Σ u (uᵀ u)⁻¹. Its estimate is a quadratic form of 8 to 50 batches, of which
@@ -94,3 +94,12 @@ def test_values_that_are_no_minimum_are_as_uncertain_as_their_distance_from_it()
     best = float(u @ y / (u @ u))
     found = widths(log, best + 0.5)
     assert found.std[0] == pytest.approx(0.5, rel=0.05)
+
+
+@pytest.mark.parametrize("gains", [(2.0,), (-3.0, 2.0, 4.0)])
+def test_one_specimen_leaves_the_spread_between_specimens_and_several_are_weighed_with_it(gains):
+    """By least squares of each, whose errors are small beside their distances; without data the prior stays."""
+    logs, u, y = zip(*(recorded(0.0, k, gain=gain) for k, gain in enumerate(gains)), strict=True)
+    best = np.array([drive @ reading / (drive @ drive) for drive, reading in zip(u, y, strict=True)])
+    expected = np.sqrt((10.0**2 + np.sum((best - best.mean()) ** 2)) / len(gains))
+    np.testing.assert_allclose(widths(logs, np.mean(gains)).spread, [expected, 7.0, 2.0], rtol=1e-3)

@@ -14,7 +14,7 @@ from app.cli.arguments import FoldCommand
 from app.cli.fold import fold_twin
 from app.cli.open_twin import recorded_twin
 from app.live.tunings.tuning_yaml import tuning_yaml, with_tuning
-from app.live.tunings.versions import Settings, accept, keep, load_into, version_text
+from app.live.tunings.versions import Settings, accept, apply_tuning, keep, load_into, version_text
 from app.twin.log_reader import read_log
 from app.twin.twin import load_twin, restore_twin, with_held
 from app.views.recording.reader import read_recording
@@ -65,27 +65,33 @@ def kept(twin, name="quiet", tuning=None):
 either = pytest.mark.parametrize("back_of", [pasted, applied])
 
 
-@pytest.mark.parametrize("back_of", ["pasted", "applied"])
-def test_the_covariance_of_a_fit_and_its_range_come_back_and_are_considered(back_of, tmp_path):
+@pytest.mark.parametrize(
+    ("spread", "said"), [(None, ""), (0.04, "as before: one log, one specimen"), (0.05, "between the logs")]
+)
+def test_the_covariance_of_a_fit_and_its_range_come_back_and_are_considered(spread, said, tmp_path):
+    """A version has all of it; in the twin's file a `std` that was there is that between specimens."""
     path = tmp_path / "motor.yaml"
     text = (TWINS / "motor_can.yaml").read_text(encoding="utf-8")
     own = yaml.safe_load(text)
     own["valid"] = {"coolant": {"min": 0, "max": 50}}
     own["parameters"] = (own.get("parameters") or {}) | {
-        "magnet_ambient": {"value": 0.4, "widen": {"coolant": {"per": 10, "by": "20 %"}}}
+        "magnet_ambient": {"value": 0.4, "std": "10 %", "widen": {"coolant": {"per": 10, "by": "20 %"}}}
     }
     path.write_text(yaml.safe_dump(own), encoding="utf-8")
     twin = load_twin(path)
     names = ("winding_tooth", "yoke_coolant", "magnet_ambient")
     R = np.array([[1.0, 0.123456789, 0.0], [0.123456789, 1.0, -0.99999], [0.0, -0.99999, 1.0]])
     R[0, 1:] = R[1:, 0] = 0.123456789, -0.123456
-    std, ends = np.array([0.001, 0.002, 0.04]), {"coolant": (20.0, 61.5), "speed": (0.0, 300.0)}
-    widths = ParameterWidths(names, std, R, 10.0 * std, 4.0, ends)
-    if back_of == "applied":
+    std, prior = np.array([0.001, 0.002, 0.003]), np.array([0.01, 0.02, 0.04])
+    ends = {"coolant": (20.0, 61.5), "speed": (0.0, 300.0)}
+    widths = ParameterWidths(names, std.copy(), R.copy(), prior, 4.0, ends, np.array([*prior[:2], spread or 0.04]))
+    if spread is None:
         found = applied(twin, "ekf", twin.tuning, widths=widths)
     else:
-        given = yaml.safe_load(tuning_yaml(twin.config, "ekf", twin.tuning, widths=widths))
-        found = restore_twin(yaml.safe_dump(own | given), twin.path)
+        assert f"; std of magnet_ambient {said}; the" in apply_tuning(twin, "ekf", twin.tuning, widths=widths)
+        found = load_twin(path)
+        R[2, :2] = R[:2, 2] = 0.0
+        std[2] = spread
     held = with_held(found).model
     assert held.considered == 0
     assert found.model.state_names[held.nx :] == (*(f"{name}_deviation" for name in names), "magnet_ambient_outside")
@@ -168,9 +174,9 @@ def test_words_stand_for_choices():
 
 def test_a_prior_comes_back():
     twin = load_twin("motor_can")
-    model = applied(twin, "ekf", twin.tuning, prior={"magnet": {"mean": 55.0, "std": 2.0}}).model
-    magnet = model.state_names.index("magnet")
-    assert (model.prior_mean[magnet], model.prior_std[magnet]) == (55.0, 2.0)
+    mean = 55.0 + np.arange(twin.model.nx)
+    model = applied(twin, "ekf", twin.tuning, prior=(mean, np.diag(mean**2))).model
+    assert np.array_equal([model.prior_mean, model.prior_std], [mean, mean])
 
 
 def test_limits_of_a_sensor_stay_with_it():
@@ -374,7 +380,8 @@ def test_a_version_that_considers_parameters_is_loaded_while_the_twin_runs(tmp_p
     with running("motor_joint", **{"source.duration": "60"}) as session:
         engine = session.engine
         before = engine.rows(engine.end() - 1, engine.end()).track.std[-1]
-        widths = ParameterWidths(("magnet_ambient",), np.array([0.1]), np.eye(1), np.array([0.1]), 1.0, {})
+        std = np.array([0.1])
+        widths = ParameterWidths(("magnet_ambient",), std, np.eye(1), std, 1.0, {}, std)
         path = tmp_path / "wide.yaml"
         path.write_text(version_text(engine.twin, Settings("ekf", engine.twin.tuning, widths=widths)), encoding="utf-8")
         load_into(engine, str(path))
