@@ -7,7 +7,8 @@ log Σ w_i' p(y | x_i), whose exponential, multiplied over the measurements, is 
 Regularised: after resampling each particle x becomes m + √(1 - h²) (x - m) and a draw from a Gaussian kernel, h times
 the root of the cloud's covariance, so that the cloud keeps its mean m and covariance, which a kernel alone would widen
 by 1 + h² each time. The bandwidth h is the one that is best for a Gaussian cloud, times the option `bandwidth`, at most
-1. Optionally only particles that have a sibling move.
+1. Optionally only particles that have a sibling move, by the kernel alone: a cloud of several peaks has no particles
+near its mean, towards which they would shrink.
 
 Each particle has its own values of the considered states. A measurement weighs the particles with them, so that mean
 and covariance of the others account for their uncertainty; then `reconsider` gives them their prior again.
@@ -283,7 +284,7 @@ def shrink(context, mean, records):
 
 @jit
 def smooth_block(context, u, dt, sensor, y, key, value, state, work, number):
-    """x ← m + √(1 - h²) (x - m) + L z: a draw from the kernel of the regularised filter."""
+    """x ← m + √(1 - h²) (x - m) + L z, or x + L z of siblings: a draw from the kernel of the regularised filter."""
     n = count_of(context)
     first, last = range_of(number, n)
     shared, cloud = work_of(context, work), own_cloud(context, state)
@@ -298,7 +299,8 @@ def smooth_block(context, u, dt, sensor, y, key, value, state, work, number):
         )
         if alone:
             if i > begin:
-                shrink(context, cloud.mean, records[begin:i])
+                if every:
+                    shrink(context, cloud.mean, records[begin:i])
                 spread_by(context, shared.L, key, begin, records[begin:i])
             begin = i + 1
 
@@ -367,7 +369,9 @@ BANDWIDTH = Option("bandwidth", 0.5, 0.0, 100.0, "", "kernel width as a part of 
 
 
 JITTERED = Option.choice(
-    "jitter", ("all", "duplicates"), "particles that the kernel moves: all, or those with a sibling"
+    "jitter",
+    ("all", "duplicates"),
+    "particles that the kernel moves: all, or those with a sibling, which do not shrink to the mean",
 )
 
 
