@@ -339,7 +339,7 @@ def test_nothing_is_left_running(shop, tmp_path):
     wait_for(lambda: begun(tmp_path, Piece("ukf", 0)))
     process = begun(tmp_path, Piece("ukf", 0))[0]
     workshop.stop()
-    assert not Path(f"/proc/{process}").exists()
+    wait_for(lambda: not Path(f"/proc/{process}").exists())  # `stop` waits for 2 s only
 
 
 def test_the_pieces_are_what_a_fold_compiles():
