@@ -417,7 +417,7 @@ def test_parts_of_a_dated_name_have_their_date_and_the_oldest_are_removed(start,
     source, engine, _ = start(split=parse_split("day", "150kB"))
     engine.submit(commands.Record(tmp_path / "%m" / "run-%Y%m%d.rrd"))
     source.put(readings(TIMES[:100], VALUES[:100]))
-    wait_for(lambda: any("removed" in line.text for line in engine.notices.since(0)))
+    wait_for(lambda: any("removed" in line.text for line in engine.notices.since(0)) and recorded_to(engine) >= 100)
     clock.now = time.struct_time((2026, 11, 24, 0, 0, 0, 1, 328, 0))
     source.put(readings(TIMES[100:200], VALUES[100:200]))
     wait_for(lambda: len(engine.recorder.written) == 2)
