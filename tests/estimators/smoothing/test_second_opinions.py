@@ -1,29 +1,11 @@
-"""Smoothers by sigma points against FilterPy's on the same data; the steady filter's against the Kalman filter's."""
+"""Smoothers by sigma points against FilterPy's on the same data."""
 
 import numpy as np
 from filterpy.kalman import JulierSigmaPoints, UnscentedKalmanFilter
 
 from estimators import Log, fold
 from estimators.model.state_space import Noise, Row, Sensor, State, StateSpaceModel
-from tests.estimators.smoothing.test_dense import START, VARIANCE, Q, moved
-
-DT, N = 0.3, 300
-
-
-def drive(seed=0):
-    rng = np.random.default_rng(seed)
-    F, cov = moved(DT)
-    x, ys = rng.multivariate_normal(*START), []
-    for _ in range(N):
-        ys.append(x[0] + rng.normal(0, np.sqrt(VARIANCE)))
-        x = F @ x + rng.multivariate_normal(np.zeros(2), cov)
-    return np.array(ys)
-
-
-def smoothed(estimator, model, ys, **settings):
-    log = Log.of(model)
-    log.add(model.sensor_names[0], DT * np.arange(ys.size), ys)
-    return fold(estimator, model, log, covariance=True, smoothed=True, **settings)
+from tests.estimators.smoothing.test_dense import Q
 
 
 def swing(x, u, p, dt, out):
