@@ -1,73 +1,12 @@
-"""Against statsmodels, on the innovations of a local level model of the Nile, and on series with gaps."""
+"""Against statsmodels, and on series with gaps; on innovations of the Nile: tests/textbook.py."""
 
 import numpy as np
 import pytest
-import statsmodels.api as sm
 from scipy.stats import chi2
 from statsmodels.stats.diagnostic import acorr_ljungbox
 from statsmodels.stats.stattools import jarque_bera as their_jarque_bera
 
 from estimators.diagnostics.innovations import jarque_bera, ljung_box
-from estimators.fold import fold
-from estimators.log import READING, Events
-from estimators.tuning import Tuning
-from tests.estimators.fit.test_plain import NILE_FLOW
-from tests.models import level_model
-from tests.support import SECOND, as_log
-
-LEVEL, IRREGULAR = 1469.1, 15098.5
-"""Variances of the Nile's level and readings, 10¹⁶ m⁶: Durbin & Koopman, Time Series Analysis by State Space Methods,
-2.2.5."""
-
-PRIOR = (1000.0, 500.0)
-"""Mean and standard deviation of the level in the first year, the same for both programs: nothing is diffuse."""
-
-GAPS = [3, 20, 21, 22, 70]
-
-AGREE = 1e-6
-
-
-NILE = level_model({"flow": IRREGULAR}, LEVEL, mean=PRIOR[0], std=PRIOR[1], linear=True)
-
-
-def innovations_of(series: np.ndarray) -> np.ndarray:
-    """Standardised, by our Kalman filter, a year taken as a second."""
-    t = SECOND * np.arange(series.size)
-    n = series.size
-    log = as_log(Events(t, t, np.full(n, READING, np.int8), np.zeros(n, np.int32), series[:, None]))
-    track = fold("kf", NILE, Tuning.of(NILE), log)
-    return track.innovation[:, 0] / track.innovation_std[:, 0]
-
-
-def theirs(series: np.ndarray):
-    """The results of statsmodels, for the same variances and prior."""
-    model = sm.tsa.UnobservedComponents(series, "llevel")
-    model.loglikelihood_burn = 0  # its own prior would be diffuse, and the first year say nothing
-    model.ssm.initialize_known(np.array([PRIOR[0]]), np.array([[PRIOR[1] ** 2]]))
-    return model.filter([IRREGULAR, LEVEL])
-
-
-@pytest.fixture(scope="module", params=["whole", "with gaps"])
-def series(request):
-    flows = NILE_FLOW.copy()
-    if request.param == "with gaps":
-        flows[GAPS] = np.nan
-    return flows
-
-
-def test_innovations_of_the_nile_are_those_of_statsmodels(series):
-    """Which gives 0 for a year that is missing."""
-    expected, ours = theirs(series).standardized_forecasts_error[0], innovations_of(series)
-    np.testing.assert_array_equal(np.isnan(ours), np.isnan(series))
-    np.testing.assert_allclose(np.nan_to_num(ours), expected, rtol=0, atol=AGREE)
-
-
-def test_gaps_are_left_out_of_normality_as_statsmodels_does():
-    flows = NILE_FLOW.copy()
-    flows[GAPS] = np.nan
-    ours = innovations_of(flows)
-    expected = their_jarque_bera(ours[np.isfinite(ours)])[:2]
-    np.testing.assert_allclose(jarque_bera(ours)[:2], expected, rtol=0, atol=AGREE)
 
 
 @pytest.mark.parametrize("kind", ["white", "correlated", "spiky"])
@@ -82,6 +21,7 @@ def test_a_broken_series_is_found_by_its_own_test_and_told_as_by_statsmodels(kin
     theirs = acorr_ljungbox(e, lags=[10])
     np.testing.assert_allclose(serial[:2], [theirs.lb_stat.iloc[0], theirs.lb_pvalue.iloc[0]], rtol=1e-9, atol=1e-12)
     np.testing.assert_allclose(normal[:2], their_jarque_bera(e)[:2], rtol=1e-9, atol=1e-12)
+    assert jarque_bera(np.insert(e, [0, 3, 20, 20, 70], np.nan)) == pytest.approx(normal, rel=1e-12)
     assert (serial.p_value < 1e-4) == (kind == "correlated")
     assert (normal.p_value < 1e-4) == (kind == "spiky")
 
