@@ -5,6 +5,7 @@ The walk x_k = a x_k-1 + w, y_k = x_k + v has y ~ N(H m, H P Hᵀ + R) as a whol
 
 import warnings
 from functools import lru_cache
+from typing import Any
 
 import numpy as np
 import pytest
@@ -63,6 +64,13 @@ def log_of(ys: np.ndarray) -> Log:
     return log
 
 
+def objective_of(log: Log, *wanted: str, tuning: Tuning | None = None, **given: Any) -> Objective:
+    """The objective of these entries on a whole log; `given` are further arguments of `Objective`."""
+    tuning = tuning or Tuning.of(MODEL)
+    entries, _ = entries_of("kf", tuning, [log], wanted)
+    return Objective("kf", tuning, tuple(entries), (Recording(log, 1.0, np.zeros(log.n, bool)),), **given)
+
+
 @lru_cache
 def covariances(n: int, rate: float) -> tuple[np.ndarray, np.ndarray]:
     """Covariance of the states, from the prior and from process noise of variance 1, each (n, n)."""
@@ -107,9 +115,7 @@ def fitted(ys):
 
 
 def test_the_objective_is_the_joint_density(ys):
-    tuning, log = Tuning.of(MODEL), log_of(ys)
-    entries, _ = entries_of("kf", tuning, [log], ("Q", "R"))
-    objective = Objective("kf", tuning, tuple(entries), (Recording(log, 1.0, np.zeros(log.n, bool)),))
+    objective = objective_of(log_of(ys), "Q", "R")
     for x in (np.log([0.5, 1.0]), np.log([0.01, 3.0])):
         # Rounding of 150 terms, each exact to 1e-12.
         assert objective.value(x) == pytest.approx(penalised(ys, x), abs=1e-8)
@@ -207,17 +213,13 @@ def test_progress_counts_every_fold_and_the_gain_of_the_search(ys, fitted):
 
 
 def test_derivatives_at_the_last_points_are_not_folded_again(ys):
-    tuning = Tuning.of(MODEL)
-    log = log_of(ys)
-    entries, _ = entries_of("kf", tuning, [log], ("Q", "R"))
     folds = []
 
     def count(done: int) -> bool:
         folds.append(done)
         return True
 
-    whole = Recording(log, 1.0, np.zeros(log.n, bool))
-    objective = Objective("kf", tuning, tuple(entries), (whole,), go=count)
+    objective = objective_of(log_of(ys), "Q", "R", go=count)
     here, there = objective.start, objective.start + 0.1
     before = [objective.slopes(point) for point in (here, there, here, there)]
     assert sum(folds) == 2 * 3
@@ -227,9 +229,7 @@ def test_derivatives_at_the_last_points_are_not_folded_again(ys):
 
 
 def test_a_step_does_not_fold_the_point_again_that_it_has_tried(ys):
-    tuning, log, points = Tuning.of(MODEL), log_of(ys), []
-    entries, _ = entries_of("kf", tuning, [log], ("Q", "R"))
-    objective = Objective("kf", tuning, tuple(entries), (Recording(log, 1.0, np.zeros(log.n, bool)),))
+    objective, points = objective_of(log_of(ys), "Q", "R"), []
     work = objective.work
     object.__setattr__(objective, "work", lambda point: points.append(point[1]) or work(point))
     quasi_newton(objective, objective.start)

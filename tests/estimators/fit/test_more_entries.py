@@ -7,11 +7,11 @@ from scipy.optimize import minimize, minimize_scalar
 from estimators.errors import ConfigError
 from estimators.fit.entries import entries_of
 from estimators.fit.fit import fit
-from estimators.fit.objective import Objective, maximise, search
+from estimators.fit.objective import maximise, search
 from estimators.fit.recording import Recording
 from estimators.model.coloured import ColouredError, coloured
 from estimators.tuning import Tuning
-from tests.estimators.fit.test_fit import DECADES, MODEL, log_of, simulated
+from tests.estimators.fit.test_fit import DECADES, MODEL, log_of, objective_of, simulated
 
 DECADE = np.log(10.0)
 
@@ -81,9 +81,7 @@ def test_how_long_errors_last_is_a_group():
 
 
 def test_a_search_without_slopes_ends_where_one_with_them_does():
-    tuning, log = Tuning.of(MODEL), log_of(simulated(1, 150))
-    entries, _ = entries_of("kf", tuning, [log], ("Q", "R.float"))
-    objective = Objective("kf", tuning, tuple(entries), (Recording(log, 1.0, np.zeros(log.n, bool)),))
+    objective = objective_of(log_of(simulated(1, 150)), "Q", "R.float")
     x, value = maximise(objective, objective.start)
     y, other = search(objective, objective.start)
     # COBYQA ends with a trust region of 0.02; half the curvature times its square is left.

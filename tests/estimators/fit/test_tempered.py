@@ -12,15 +12,14 @@ from estimators.fit.objective import Objective, maximise
 from estimators.fit.recording import Recording, held_out_rows
 from estimators.fit.uncertainty import curvature
 from estimators.tuning import Tuning
-from tests.estimators.fit.test_fit import DECADES, MODEL, dense, log_of, simulated
+from tests.estimators.fit.test_fit import DECADES, MODEL, dense, log_of, objective_of, simulated
 
 
 @pytest.fixture(scope="module")
 def climbed():
     ys = simulated(1, 200)
-    tuning, log = Tuning.of(MODEL).set("Q.level", 0.15).set("R.float", 0.6), log_of(ys)
-    entries, _ = entries_of("kf", tuning, [log], ("Q", "R.float"))
-    objective = Objective("kf", tuning, tuple(entries), (Recording(log, 1.0, np.zeros(log.n, bool)),))
+    tuning = Tuning.of(MODEL).set("Q.level", 0.15).set("R.float", 0.6)
+    objective = objective_of(log_of(ys), "Q", "R.float", tuning=tuning)
     x, _ = maximise(objective, objective.start)
     return ys, objective, x, curvature(objective, x)
 
