@@ -14,17 +14,13 @@ from estimators.fold import Fold
 from estimators.log import READING
 from estimators.registry import ESTIMATORS, unfit
 from estimators.tuning import Tuning
-from tests.models import level_model
+from tests.models import first_state_squared, level_model
 from tests.support import log_of
 
 R = 0.04
 
 
-def squared(x, u, p, out):
-    out[0] = x[0] * x[0]
-
-
-MODEL = level_model({"square": R}, 1e-12, h=squared)
+MODEL = level_model({"square": R}, 1e-12, h=first_state_squared)
 FILTERS = [name for name, entry in ESTIMATORS.items() if unfit(entry, MODEL) is None]
 
 

@@ -12,6 +12,7 @@ from estimators.compiled.model import compile_model
 from estimators.errors import ModelError
 from estimators.model.state_space import Input, Noise, Parameter, Row, Sensor, State, StateSpaceModel
 from tests.estimators.compiled.test_jacobians import F, H, P, U, f, h, model
+from tests.models import first_state, first_state_squared, unchanged
 
 NOT_COMPILABLE = {"a": 1}
 
@@ -251,20 +252,12 @@ def likelihood_centres_y(y, x, u, p, r):
     return -0.5 * y[0] ** 2 / r[0]
 
 
-def still(x, u, p, dt, out):
-    out[0] = x[0]
-
-
-def itself(x, u, p, out):
-    out[0] = x[0]
-
-
 def walk(sensor=(), **changes):
     """A state whose prior mean is zero, as are its input and the reading that it expects."""
     parts = dict(
-        name="walk", title="", states=(State("s", "m", 0.0, 0.5),), noises=(Noise("s", "m²/s", 0.3),), f=still,
+        name="walk", title="", states=(State("s", "m", 0.0, 0.5),), noises=(Noise("s", "m²/s", 0.3),), f=unchanged,
         inputs=(Input("v", "m/s"),),
-        sensors=(Sensor("y", (Row("y", "m", 0.04),), **({"h": itself} | dict(sensor))),),
+        sensors=(Sensor("y", (Row("y", "m", 0.04),), **({"h": first_state} | dict(sensor))),),
     )  # fmt: skip
     return StateSpaceModel(**(parts | changes))
 
@@ -350,10 +343,6 @@ def with_a_constant(x, u, p, dt, out):
     out[0] = 1e6 + 0.9 * (x[0] - 1e6) + dt * u[0]
 
 
-def squares_in_h(x, u, p, out):
-    out[0] = x[0] * x[0]
-
-
 def with_an_offset(x, u, p, out):
     out[0] = 273.15 + x[0]
 
@@ -365,7 +354,7 @@ def test_what_is_said_to_be_linear_is_tried(mean, std):
     states = (State("s", "m", mean, std),)
     compile_model(walk(states=states, linear=True))
     compile_model(walk(states=states, linear=True, f=with_a_constant, sensor={"h": with_an_offset}))
-    for changes, what in (({"f": squares}, "f"), ({"sensor": {"h": squares_in_h}}, "h of sensor y")):
+    for changes, what in (({"f": squares}, "f"), ({"sensor": {"h": first_state_squared}}, "h of sensor y")):
         compile_model(walk(states=states, **changes))
         with pytest.raises(ModelError, match=f"model walk: {what} is not linear, though the model says linear=True"):
             compile_model(walk(states=states, linear=True, **changes))

@@ -10,7 +10,7 @@ from estimators.track import FAILED
 from estimators.tuning import Tuning
 from tests.estimators.gaussian.test_square_root import EVERYTHING
 from tests.estimators.interpreted.test_filterpy import P0, PENDULUM, X0, log  # noqa: F401  the fixture
-from tests.models import complex_step, level_model
+from tests.models import complex_step, first_state_squared, level_model
 from tests.support import assert_same, folded, log_of
 
 
@@ -44,10 +44,6 @@ def test_many_iterations_find_the_mode_and_count_the_reading_once(sensor, y):
     np.testing.assert_allclose(cov, np.linalg.inv(np.diag(1 / P0) + H.T @ np.diag(1 / r) @ H), rtol=0, atol=1e-7)
 
 
-def square(x, u, p, out):
-    out[0] = x[0] * x[0]
-
-
 @pytest.mark.parametrize("most", [3, 100])
 def test_iterations_end_with_a_step_below_1e_10_deviations(most):
     """Gauss-Newton by hand, whose steps shrink by a third: it ends 1.3e-11 before the mode, after 24 of them."""
@@ -57,7 +53,7 @@ def test_iterations_end_with_a_step_below_1e_10_deviations(most):
         x = 1.0 - H * (before * before + H * (1.0 - before)) / (H * H + 0.04 / 0.25)
         if abs(x - before) < 1e-10 * 0.5:
             break
-    model = level_model({"y": 0.04}, 0.0, mean=1.0, std=0.5, h=square)
+    model = level_model({"y": 0.04}, 0.0, mean=1.0, std=0.5, h=first_state_squared)
     track = folded("iekf", model, log_of(1, (0, READING, 0.0)), options={"iterations": most}).track
     assert track.mean[0, 0] == pytest.approx(x, rel=0, abs=1e-13)
 
