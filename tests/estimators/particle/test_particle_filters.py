@@ -127,22 +127,17 @@ def test_any_pieces_and_any_threads_give_the_same_bits(name, n):
 
 
 @pytest.mark.parametrize("name", NAMES)
-@pytest.mark.parametrize("max_step", [np.inf, 0.1])
-def test_substeps_draw_noise_of_their_own(name, max_step):
-    """Ten steps of the same draws would make ten times the variance of independent ones."""
-    model = scalar(max_step=max_step)
+@pytest.mark.parametrize(
+    ("changes", "variance"), [({}, 0.3), ({"max_step": 0.1}, 0.3), ({"Q": relative}, 0.3 * (2.0**2 + 0.25))]
+)
+def test_noise_is_of_each_substep_and_of_each_particle(name, changes, variance):
+    """Ten steps of the same draws would make ten times the variance of independent ones; 0.3 x² is each particle's."""
+    model = scalar(**changes)
     track = fold(name, model, Tuning.of(model).with_options({"particles": 1e5}), log_of(1, (0, TICK, 0), (1, TICK, 0)))
-    # A variance of 10⁵ draws is right to 5·√(2/10⁵) = 2.3 %.
-    assert abs(track.std[1, 0] ** 2 / (0.25 + 0.3) - 1) < 0.023
-    assert abs(track.mean[1, 0] - 2.0) < 5 * np.sqrt(0.55 / 1e5)
-
-
-@pytest.mark.parametrize("name", NAMES)
-def test_noise_that_depends_on_the_state_is_each_particles_own(name):
-    model = scalar(Q=relative)
-    track = fold(name, model, Tuning.of(model).with_options({"particles": 1e5}), log_of(1, (0, TICK, 0), (1, TICK, 0)))
-    # E x² = 4 + 0.25; the draws' kurtosis is below 4.
-    assert abs(track.std[1, 0] ** 2 / (0.25 + 0.3 * 4.25) - 1) < 5 * np.sqrt(3 / 1e5)
+    # A variance of 10⁵ draws is right to √(2/10⁵); of a kurtosis below 4, as with 0.3 x², to √(3/10⁵).
+    std = np.sqrt((3 if "Q" in changes else 2) / 1e5)
+    assert abs(track.std[1, 0] ** 2 / (0.25 + variance) - 1) < 5 * std
+    assert abs(track.mean[1, 0] - 2.0) < 5 * np.sqrt((0.25 + variance) / 1e5)
 
 
 def test_the_kernel_keeps_mean_and_covariance():
