@@ -25,12 +25,12 @@ MAX_VALUES = 100_000  # A twin has a few hundred values; nested aliases could ot
 
 
 def rounded(value: Any, digits: int = 4) -> Any:
-    """Return a number, or a list or mapping of them, to so many significant digits."""
+    """Return a float, or a list or mapping of them, to so many significant digits; anything else as it is."""
     if isinstance(value, dict):
         return {key: rounded(item, digits) for key, item in value.items()}
     if isinstance(value, list):
         return [rounded(item, digits) for item in value]
-    return float(f"{value:.{digits}g}")
+    return float(f"{value:.{digits}g}") if isinstance(value, float) else value
 
 
 class _Loader(yaml.SafeLoader):

@@ -27,14 +27,14 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 from scipy.special import stdtrit
 
 from config.companion_schema import FigureSection, ReferenceSection
 from config.problems import check_section
-from config.yaml_files import as_flow, read_text, writing
+from config.yaml_files import as_flow, read_text, rounded, writing
 from estimators.diagnostics.health import PROBABILITY
 from estimators.diagnostics.score import score
 from estimators.errors import ConfigError
@@ -249,19 +249,13 @@ def write_baseline(path: Path, name: str, found: ReferenceSection) -> None:
         ConfigError: If the file cannot be written.
     """
     lines = [f"# Baseline of {name} for `nisus guard`, written by `nisus guard --accept --note ...`."]
-    for key, value in found.model_dump(mode="json", exclude_none=True).items():
-        if key == "figures":
-            lines += ["figures:", *(f"  {as_flow(name)}: {as_flow(_rounded(each))}" for name, each in value.items())]
-        else:
-            lines.append(f"{key}: {as_flow(_rounded(value))}")
+    given = found.model_dump(mode="json", exclude_none=True)
+    figures = given.pop("figures")
+    lines += [f"{key}: {as_flow(value)}" for key, value in rounded(given, DIGITS).items()]
+    lines.append("figures:")
+    for figure, each in figures.items():
+        section = {"values": rounded(each["values"], DIGITS), "allowed": rounded(each["allowed"], 3)}
+        lines.append(f"  {as_flow(figure)}: {as_flow(section)}")
     with writing(path):
         path.parent.mkdir(parents=True, exist_ok=True)
         path.write_text("\n".join(lines) + "\n", encoding="utf-8")
-
-
-def _rounded(value: Any, digits: int = DIGITS) -> Any:
-    if isinstance(value, dict):
-        return {key: _rounded(item, 3 if key == "allowed" else digits) for key, item in value.items()}
-    if isinstance(value, list):
-        return [_rounded(item, digits) for item in value]
-    return float(f"{value:.{digits}g}") if isinstance(value, float) else value

@@ -9,7 +9,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from config.companion_schema import LearnedHeadSection
-from config.yaml_files import as_flow, as_section
+from config.yaml_files import as_flow, as_section, rounded
 from estimators.diagnostics.sensitivity.responses import digits
 from estimators.fit.judge import PartScore
 from estimators.learned.train import OnWindows, Trained
@@ -151,9 +151,9 @@ def noises_of(
     """
     own, learned = {}, {}
     for name, before, rest in zip(corrects, trained.before.tolist(), trained.drift.tolist(), strict=True):
-        learned[name] = _rounded(max(before - rest, MIN_NOISE_SHARE * before))
+        learned[name] = rounded(max(before - rest, MIN_NOISE_SHARE * before), DIGITS)
         if physics.Q is None and name in (noise.name for noise in physics.noises):
-            own[name] = _rounded(rest)
+            own[name] = rounded(rest, DIGITS)
     return own, learned
 
 
@@ -168,7 +168,7 @@ def correction_text(
         saved=now(),
         learned_on=tuple(learned_on),
         how=trained.words,
-        scores={name: _rounded(value) for name, value in (scores or {}).items()},
+        scores=rounded(dict(scores or {}), DIGITS),
     )
     own, learned = noises_of(physics, trained, corrects)
     lines = [
@@ -187,21 +187,13 @@ def correction_text(
 def _numbers(correction: Correction, net: Path | None) -> list[str]:
     """Return the parameters of a correction as lines."""
     if isinstance(correction, GaussianProcess):
-        lengths = [_rounded(value) for value in correction.lengths.tolist()]
-        lines = ["kind: gp", f"lengths: {as_flow(lengths)}", f"ratio: {_rounded(correction.ratio)}"]
+        lengths = as_flow(rounded(correction.lengths.tolist(), DIGITS))
+        lines = ["kind: gp", f"lengths: {lengths}", f"ratio: {rounded(correction.ratio, DIGITS)}"]
     elif isinstance(correction, Ridge):
-        lines = ["kind: ridge", f"penalty: {_rounded(correction.penalty)}", f"degree: {correction.degree}"]
+        lines = ["kind: ridge", f"penalty: {rounded(correction.penalty, DIGITS)}", f"degree: {correction.degree}"]
     else:
         lines = ["kind: net", f"net: {as_flow(str(net))}"]
-    lines += ["points:", *(f"  - {as_flow(_row(row))}" for row in correction.points.tolist())]
+    lines += ["points:", *(f"  - {as_flow(row)}" for row in rounded(correction.points.tolist(), DIGITS))]
     if not isinstance(correction, Net):
-        lines += ["rates:", *(f"  - {as_flow(_row(row))}" for row in correction.rates.tolist())]
+        lines += ["rates:", *(f"  - {as_flow(row)}" for row in rounded(correction.rates.tolist(), DIGITS))]
     return lines
-
-
-def _row(values: Sequence[float]) -> list[float]:
-    return [_rounded(value) for value in values]
-
-
-def _rounded(value: float) -> float:
-    return float(f"{value:.{DIGITS}g}")
