@@ -126,6 +126,11 @@ def number_text(value: Cell, decimals: int | None = None, scale: float = 1.0, ab
     return digits(scale * value) if decimals is None else f"{scale * value:,.{decimals}f}"
 
 
+def finite_text(value: float) -> str:
+    """Return a number as text with three significant digits; a dash if it is infinite or unknown."""
+    return digits(value) if np.isfinite(value) else "-"
+
+
 def plain(value: Any, *, infinity_text: bool = False) -> Any:
     """Return a copy that JSON can hold.
 

@@ -29,7 +29,7 @@ from estimators.log import READING, Log
 from estimators.model.state_space import StateSpaceModel
 
 from ..present.export.calibration_lines import calibration_lines, health_shares
-from ..present.result import WORSE, Bar, Cell, Topic, plain
+from ..present.result import WORSE, Bar, Cell, Topic, finite_text, plain
 from ..twin.twin import Twin
 from .advice.draft import undecided_lines
 from .advice.measured import Measured, repeat_lines, repeats_of
@@ -461,8 +461,8 @@ def _held_out_topics(checked: Checked) -> list[Topic]:
     """Return the prediction of each held-out sensor, and the filter against the model alone."""
     rows, states = checked.held_out.rows, checked.held_out.states
     said = [
-        f"{row.row} is predicted {WORSE}: RMS {_text(row.rms)} {row.unit} by the other sensors, "
-        f"{_text(row.open_loop)} by the model alone."
+        f"{row.row} is predicted {WORSE}: RMS {finite_text(row.rms)} {row.unit} by the other sensors, "
+        f"{finite_text(row.open_loop)} by the model alone."
         for row in rows
         if row.worse
     ]
@@ -492,8 +492,8 @@ def _held_out_topics(checked: Checked) -> list[Topic]:
         ("state", "unit", "RMS of the filter", "RMS of the open loop", ""),
         [(item.state, item.unit, item.filter, item.open_loop, WORSE if item.worse else "") for item in states],
         *(
-            f"The filter makes {item.state} {WORSE}: RMS {_text(item.filter)} {item.unit} with measurements, "
-            f"{_text(item.open_loop)} without."
+            f"The filter makes {item.state} {WORSE}: RMS {finite_text(item.filter)} {item.unit} with measurements, "
+            f"{finite_text(item.open_loop)} without."
             for item in states
             if item.worse
         ),
@@ -512,14 +512,10 @@ def _timing(checked: Checked) -> Topic:
             (
                 *(item.sensor, item.n, item.rate, item.gap),
                 f"{100 * item.missing:.2g}" if np.isfinite(item.missing) else "-",
-                " / ".join(map(_text, item.lateness)) if known else "not known",
+                " / ".join(map(finite_text, item.lateness)) if known else "not known",
             )
             for item in checked.arrivals
         ],
         "" if known else "Lateness is not known: the log has only the time of measurement.",
         *(f"{line}." for line in (*repeat_lines(checked.repeats), *undecided_lines(checked.repeats.items()))),
     )
-
-
-def _text(value: float) -> str:
-    return digits(value) if np.isfinite(value) else "-"

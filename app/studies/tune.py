@@ -17,7 +17,7 @@ from estimators.fit.judge import PartScore, PredictionScore, Worth
 from estimators.fit.objective import FitProgress
 from estimators.registry import find_estimator
 
-from ..present.result import Topic
+from ..present.result import Topic, finite_text
 from ..present.runs_json import correlated, fit_json
 from ..twin.twin import Twin
 
@@ -162,10 +162,6 @@ def heading(twin: Twin, fitted: Fitted) -> str:
     return f"# Fitted by `nisus tune {twin.name}`: {gained}.\n# These sections stand in place of the twin's own.\n"
 
 
-def _number(value: float) -> str:
-    return digits(value) if np.isfinite(value) else "-"
-
-
 def _pair(before: float, after: float, form: str, unit: str = "") -> str:
     """Return a figure before and after; a dash where it is unknown."""
     old, new = (f"{value:{form}}" if np.isfinite(value) else "-" for value in (before, after))
@@ -176,9 +172,9 @@ def _entries(twin: Twin, fitted: Fitted) -> Topic:
     rows = [
         (
             line.key,
-            _number(line.before),
-            _number(line.after) if fitted.penalised else f"{line.after:,.{PLAIN_DIGITS}g}",
-            "" if line.alone else f"{_number(line.low)} to {_number(line.high)}",
+            finite_text(line.before),
+            finite_text(line.after) if fitted.penalised else f"{line.after:,.{PLAIN_DIGITS}g}",
+            "" if line.alone else f"{finite_text(line.low)} to {finite_text(line.high)}",
             line.unit,
             _remark(line),
         )
@@ -256,7 +252,8 @@ def _rows(kind: str, group: str, before: Worth, after: Worth) -> list[tuple[str,
         old, new = (getattr(part, group).get(name) for part in worths)
         if not isinstance(old, PredictionScore) or not isinstance(new, PredictionScore):
             return "", ""
-        return f"{_number(old.rms)} -> {_number(new.rms)}", _pair(100 * old.coverage, 100 * new.coverage, ".0f", " %")
+        rms = f"{finite_text(old.rms)} -> {finite_text(new.rms)}"
+        return rms, _pair(100 * old.coverage, 100 * new.coverage, ".0f", " %")
 
     parts = (before.fitted, after.fitted), (before.held_out, after.held_out)
     names = dict.fromkeys(name for part in parts for name in getattr(part[0], group))
@@ -270,7 +267,9 @@ def _widths(twin: Twin, fitted: Fitted) -> Topic:
     assert widths is not None
     units = {item.name: item.unit for item in twin.model.parameters}
     columns = zip(widths.names, widths.std.tolist(), widths.prior.tolist(), strict=True)
-    rows = [(name, _number(std), _number(prior), units[name], f"{std / prior:.0%}") for name, std, prior in columns]
+    rows = [
+        (name, finite_text(std), finite_text(prior), units[name], f"{std / prior:.0%}") for name, std, prior in columns
+    ]
     said = f"Errors that last leave 1/{widths.inflation:.3g} of the information. A kept version considers these widths."
     if not find_estimator(fitted.estimator, twin.model).considers:
         said = f"{fitted.estimator} cannot consider parameters: a kept version leaves these widths out."
