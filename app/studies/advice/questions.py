@@ -155,10 +155,10 @@ def consistent(measured: Measured, estimator: str, options: Options = None) -> C
     return CONSISTENT.claim(NO, nis, reason, "; ".join(remedies))
 
 
-def worst(found: Linearity) -> tuple[str, float]:
-    """Return the state or sensor row in which EKF and UKF differ most, and by how much, σ."""
-    most = max((*found.states, *found.rows), key=lambda item: item.most)
-    return most.name, most.most
+def worst(found: Linearity) -> tuple[str, float, str]:
+    """Return the state or sensor row in which EKF and UKF differ most, by how much, σ, and both in words."""
+    name, _, apart = max((*found.states, *found.rows), key=lambda item: item.most)
+    return name, apart, f"ekf and ukf agree to within {apart_text(apart)} (95th percentile; largest for {name})"
 
 
 def curvature(measured: Measured) -> Claim:
@@ -166,8 +166,7 @@ def curvature(measured: Measured) -> Claim:
     found = measured.linearity
     if found.reason:
         return CURVATURE.claim(UNTOLD, None, found.reason)
-    name, apart = worst(found)
-    reason = f"ekf and ukf agree to within {apart_text(apart)} (95th percentile; largest for {name})"
+    name, apart, reason = worst(found)
     if not np.isfinite(apart):
         reason = f"ekf loses {name} where ukf does not"
     gain = measured.likelihood("ukf") - measured.likelihood("ekf")
@@ -267,8 +266,7 @@ def linear(measured: Measured) -> Claim:
         if model.linear:
             return LINEAR.claim(YES, None, "declared by the model: linear=True")
         return LINEAR.claim(UNTOLD, None, found.reason)
-    name, apart = worst(found)
-    reason = f"ekf and ukf agree to within {apart_text(apart)} (95th percentile; largest for {name})"
+    _, apart, reason = worst(found)
     if model.linear:
         return LINEAR.claim(YES, apart, f"declared by the model (linear=True), and {reason}")
     if apart <= EXACT:
