@@ -42,7 +42,8 @@ from typing import NamedTuple
 import numpy as np
 
 from ..diagnostics.references import references
-from ..log import INPUT
+from ..log import INPUT, Events
+from ..model.state_space import StateSpaceModel
 from ..track import USED, Track
 from .aims import MAX_ERROR, WITNESSES, Aim, correlation_time, track_of
 from .entries import Setting
@@ -341,36 +342,32 @@ def _residuals_at(
     aim: Aim,
     item: tuple[int, tuple[str, float] | None],
 ) -> tuple[np.ndarray, np.ndarray, dict[str, tuple[float, float]]]:
-    """Return the residuals of recording k with a parameter at a value; for None, at the setting, its ranges, too."""
+    """Return the residuals of recording k with a parameter at a value; for None, at the setting, its ranges, too.
+
+    They are the errors of predictions at each event (n, rows), NaN where there is none, and their deviations. The
+    columns are the rows of each sensor, then the references.
+    """
     k, point = item
     record, tuning = recordings[k], setting.tuning
     if point is not None:
         tuning = tuning.set(f"p.{point[0]}", float(point[1]))
     track = track_of(estimator, setting._replace(tuning=tuning), record)
-    ranges = _ranges(record, track, setting) if point is None else {}
-    return *_residuals(setting, record, track, aim), ranges
-
-
-def _residuals(setting: Setting, record: Recording, track: Track, aim: Aim) -> tuple[np.ndarray, np.ndarray]:
-    """Return the errors of predictions at each event (n, rows), NaN where there is none, and their deviations.
-
-    The columns are the rows of each sensor, then the references.
-    """
-    held = record.held_out if record.held_out.size else np.zeros(record.log.n, bool)
-    model, log = setting.tuning.model, record.log
+    model, log = tuning.model, record.log
+    held = record.held_out if record.held_out.size else np.zeros(log.n, bool)
     errors, stds = [], []
     for s, sensor in enumerate(model.sensors):
         own = (track.verdict == USED) & ~held & (log.events.channel == s)
         rows = slice(0, len(sensor.rows))
         errors.append(np.where(own[:, None], track.innovation[:, rows], np.nan))
         stds.append(track.innovation_std[:, rows])
-    for item in references(model, log.events, track) if aim.kind == WITNESSES else ():
+    for reference in references(model, log.events, track) if aim.kind == WITNESSES else ():
         error, std = np.full((2, log.n, 1), np.nan)
-        error[item.rows, 0], std[item.rows, 0] = item.error, item.std
+        error[reference.rows, 0], std[reference.rows, 0] = reference.error, reference.std
         error[held] = np.nan
         errors.append(error)
         stds.append(std)
-    return np.concatenate(errors, axis=1), np.concatenate(stds, axis=1)
+    ranges = _ranges(model, log.events, track, ~held) if point is None else {}
+    return np.concatenate(errors, axis=1), np.concatenate(stds, axis=1), ranges
 
 
 def _weights(z: np.ndarray) -> np.ndarray:
@@ -387,12 +384,10 @@ def _weights(z: np.ndarray) -> np.ndarray:
     return found
 
 
-def _ranges(record: Recording, track: Track, setting: Setting) -> dict[str, tuple[float, float]]:
-    """Return the range of each shown state and input over the fitted events of a recording."""
-    held = record.held_out if record.held_out.size else np.zeros(record.log.n, bool)
-    model, log = setting.tuning.model, record.log
-    series = {state.name: track.mean[~held, k] for k, state in enumerate(model.shown_states)}
-    inputs = log.events.value[(log.events.kind == INPUT) & ~held]
+def _ranges(model: StateSpaceModel, events: Events, track: Track, fitted: np.ndarray) -> dict[str, tuple[float, float]]:
+    """Return the range of each shown state and input over the fitted events (n,) of a recording."""
+    series = {state.name: track.mean[fitted, k] for k, state in enumerate(model.shown_states)}
+    inputs = events.value[(events.kind == INPUT) & fitted]
     series |= {item.name: inputs[:, k] for k, item in enumerate(model.inputs)}
     finite = {name: column[np.isfinite(column)] for name, column in series.items()}
     return {name: (float(column.min()), float(column.max())) for name, column in finite.items() if column.size}
