@@ -195,11 +195,9 @@ def track_of(estimator: str, setting: Setting, recording: Recording, without: in
 
 def sensors_in_turn(setting: Setting, recordings: list[Recording]) -> list[int]:
     """Return the sensors that are used and report; none if there is only one, which leaves nothing to predict it by."""
-    found: set[int] = set()
-    for record in recordings:
-        log = record.log
-        found |= set(np.unique(log.events.channel[log.events.kind == READING]).tolist())
-    sensors = sorted(int(s) for s in found if setting.tuning.used[s])
+    logs = [record.log.events for record in recordings]
+    found = np.unique(np.concatenate([events.channel[events.kind == READING] for events in logs]))
+    sensors = [int(s) for s in found if setting.tuning.used[s]]
     return sensors if len(sensors) > 1 else []
 
 

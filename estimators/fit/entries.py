@@ -196,16 +196,12 @@ def with_values(tuning: Tuning, entries: Sequence[TuningEntry], values: Sequence
 
 def _all(entry: Estimator, tuning: Tuning) -> dict[str, TuningEntry]:
     model = tuning.model
-    found = []
-    for item in tuning.items():
-        group = item.key.partition(".")[0]
-        found.append(_entry(item.key, item.unit, item.value, item.low, item.high, SPREAD[group]))
+    found = [_entry(item.key, item.unit, item.value, item.low, item.high) for item in tuning.items()]
     chosen = entry.complete(tuning.options)
     for option in entry.options:
         # A choice or a count has no nearby value.
         if not option.choices and not option.whole:
-            key = f"options.{option.name}"
-            found.append(_entry(key, option.unit, chosen[option.name], option.low, option.high, SPREAD["options"]))
+            found.append(_entry(f"options.{option.name}", option.unit, chosen[option.name], option.low, option.high))
     if not isinstance(model.states, Field) and model.nx <= LARGE:
         for state in model.states:
             value, deviation = float(state.mean), float(state.std)
@@ -213,13 +209,14 @@ def _all(entry: Estimator, tuning: Tuning) -> dict[str, TuningEntry]:
                 found.append(
                     TuningEntry(f"prior.{state.name}.mean", state.unit, value, -np.inf, np.inf, False, deviation)
                 )
-                found.append(_entry(f"prior.{state.name}.std", state.unit, deviation, 0.0, np.inf, SPREAD["prior"]))
-    found.append(_entry(SCALE, "", 1.0, 0.0, np.inf, SPREAD[SCALE]))
+                found.append(_entry(f"prior.{state.name}.std", state.unit, deviation, 0.0, np.inf))
+    found.append(_entry(SCALE, "", 1.0, 0.0, np.inf))
     return {item.key: item for item in found}
 
 
-def _entry(key: str, unit: str, value: float, low: float, high: float, spread: float) -> TuningEntry:
+def _entry(key: str, unit: str, value: float, low: float, high: float) -> TuningEntry:
     if low >= 0.0 and value > 0.0:
+        spread = SPREAD[key.partition(".")[0]]
         return TuningEntry(key, unit, value, max(low, value / MAX_FACTOR), min(high, value * MAX_FACTOR), True, spread)
     width = abs(value) or (high - low if np.isfinite(high - low) else 1.0)
     return TuningEntry(key, unit, value, low, high, False, width)
@@ -237,7 +234,7 @@ def _find(key: str, known: Mapping[str, TuningEntry], tuning: Tuning) -> TuningE
         remedy = none + nearest(key, own or [*known, *GROUPS])
         raise ConfigError(f"{shown_name(key)} is no entry that can be fitted; {remedy}")
     unit = model.sensors[model.sensor_names.index(name)].rows[0].unit
-    return _entry(key, f"({unit})²" if unit else "", float(tuning.get(key) or 0.0), 0.0, np.inf, SPREAD["R"])
+    return _entry(key, f"({unit})²" if unit else "", float(tuning.get(key) or 0.0), 0.0, np.inf)
 
 
 def _against(item: TuningEntry, tuning: Tuning, logs: Sequence[Log], references: bool) -> str:

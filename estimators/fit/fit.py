@@ -323,6 +323,5 @@ def _lines(
     correlation = np.full((len(lines), len(lines)), np.nan)
     rows = [k for k, item in enumerate(entries) if item.key in place]
     if rows:
-        order = [place[entries[k].key] for k in rows]
-        correlation[np.ix_(rows, rows)] = shape.correlation[np.ix_(order, order)]
+        correlation[np.ix_(rows, rows)] = shape.correlation
     return tuple(lines), correlation

@@ -266,8 +266,7 @@ def _correlations(setting: Setting, folded: list[tuple[Recording, Track]], held_
         for k in range(len(sensor.rows)):
             series = []
             for record, track in folded:
-                own = (track.verdict == USED) & (record.held_out == held_out)
-                own &= record.log.events.channel == s
+                own = (track.verdict == USED) & (record.held_out == held_out) & (record.log.events.channel == s)
                 e = track.innovation[own, k] / track.innovation_std[own, k]
                 e = e[np.isfinite(e)]
                 if e.size >= MIN_CORRELATED and np.ptp(e) > 0.0:
@@ -311,7 +310,7 @@ def verdict(before: Worth, after: Worth, aim: Aim, *, changed: bool = True) -> F
     against = [
         reason
         for group, kind in groups.items()
-        for name, old, new in _pairs(getattr(one, group), getattr(other, group))
+        for name, old, new in _pairs(one, other, group)
         for reason in _against(f"held-out {kind} {name}", old, new)
     ]
     reasons += against
@@ -323,12 +322,10 @@ def _has_references(worth: Worth) -> bool:
     return bool(worth.held_out.withheld or worth.held_out.states)
 
 
-def _pairs(
-    olds: dict[str, PredictionScore], news: dict[str, PredictionScore]
-) -> Iterator[tuple[str, PredictionScore, PredictionScore]]:
-    """Yield the predictions that two tunings share, by name."""
-    for name in (name for name in olds if name in news):
-        yield name, olds[name], news[name]
+def _pairs(one: PartScore, other: PartScore, group: str) -> list[tuple[str, PredictionScore, PredictionScore]]:
+    """Return the predictions of a group, such as `states`, that two parts share, by name."""
+    olds, news = getattr(one, group), getattr(other, group)
+    return [(name, olds[name], news[name]) for name in olds if name in news]
 
 
 def _gain(one: PartScore, other: PartScore, aim: Aim) -> tuple[float, float]:
@@ -472,5 +469,5 @@ def _in_band(own: Worth, other: Worth) -> bool:
         new.coverage >= min(MIN_COVERAGE, old.coverage)
         for one, two in zip(own, other, strict=True)
         for group in ("withheld", "states")
-        for _, old, new in _pairs(getattr(one, group), getattr(two, group))
+        for _, old, new in _pairs(one, two, group)
     )

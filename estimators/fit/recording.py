@@ -61,10 +61,7 @@ def held_out_rows(log: Log, blocks: int = BLOCKS) -> np.ndarray:
 
 def until_last_fitted(recording: Recording) -> Recording:
     """Return the recording up to the last event that takes part in the fit; nothing later changes its objective."""
-    fitted = np.flatnonzero(~recording.held_out)
-    n = int(fitted[-1]) + 1 if fitted.size else recording.log.n
-    if n == recording.log.n:
-        return recording
+    n = int(np.flatnonzero(~recording.held_out)[-1]) + 1
     log = _selected(recording.log, np.arange(recording.log.n) < n)
     return recording._replace(log=log, held_out=recording.held_out[:n])
 
