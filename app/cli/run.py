@@ -49,12 +49,13 @@ def run_twin(arguments: RunCommand, workers: Sequence[Compiler] = ()) -> int:
         )
     if arguments.log_format == "json":
         use_lines_of_json()
-    if arguments.record is not None and arguments.record.suffix != ".rrd":
-        raise ConfigError(f"--record {arguments.record}: must end in .rrd")
-    if arguments.record is not None:
-        check_date(arguments.record)
-    if arguments.record is not None and os.path.lexists(arguments.record):
-        raise ConfigError(f"--record {arguments.record}: {TAKEN}")
+    record = arguments.record
+    if record is not None:
+        if record.suffix != ".rrd":
+            raise ConfigError(f"--record {record}: must end in .rrd")
+        check_date(record)
+        if os.path.lexists(record):
+            raise ConfigError(f"--record {record}: {TAKEN}")
     if arguments.json and not arguments.headless:
         raise ConfigError("--json: is the result of a run without a page; give --headless")
     split = parse_split(arguments.record_split, arguments.record_keep)
@@ -86,7 +87,7 @@ def run_twin(arguments: RunCommand, workers: Sequence[Compiler] = ()) -> int:
         opening, wanted, opener, page=page, split=split, recordings=arguments.recordings,
         printed=arguments.log_format is not None,
     )  # fmt: skip
-    session.run(record=arguments.record, duration=arguments.duration, until_finished=arguments.headless)
+    session.run(record=record, duration=arguments.duration, until_finished=arguments.headless)
     if arguments.headless:
         status = session.engine.status()
         lines = session.engine.notices.since(0)

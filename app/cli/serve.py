@@ -59,9 +59,9 @@ def serve(arguments: ServeCommand) -> int:
         use_lines_of_json()
     grants = _grants(arguments)
     twins, folder = _named(arguments.twins)
-    options = TwinPlaces(arguments.store, arguments.recordings, arguments.log_format == "json")
     split = parse_split(arguments.archive_split, arguments.archive_keep, "--archive")
-    options = options._replace(archive=arguments.archive, split=split)
+    json = arguments.log_format == "json"
+    options = TwinPlaces(arguments.store, arguments.recordings, json, arguments.archive, split)
     for place in (options.store, options.recordings, options.archive):
         if place is not None and place.exists() and not place.is_dir():
             raise ConfigError(f"{place}: must be a folder, in which each twin has its own file")
