@@ -11,7 +11,7 @@ from config.yaml_files import shown_path
 from estimators.diagnostics.score import score
 from estimators.errors import ConfigError, printable
 
-from ..live.changes import difference
+from ..live.changes import difference, value_text
 from ..live.tunings.versions import (
     COVERAGE,
     LIKELIHOOD,
@@ -151,7 +151,7 @@ def _compare(arguments: Arguments) -> None:
         for name, before in scores[0].items()
         if name in scores[1]
     )
-    entries_of = tuple((key, _value_text(before), _value_text(after)) for key, before, after in differ)
+    entries_of = tuple((key, value_text(before), value_text(after)) for key, before, after in differ)
     differing = Topic("Entries that differ", () if entries_of else ("None.",), ("entry", *names), entries_of)
     scored = Topic("Scores", () if rows else ("Both versions need scores.",), ("score", *names, ""), rows)
     print(to_text([differing, scored]))
@@ -161,7 +161,3 @@ def _verdict(name: str, before: float, after: float) -> str:
     """Return whether a score got better or worse, as `nisus guard` counts."""
     change = badness(name, after) - badness(name, before)
     return "worse" if change > 0.0 else "better" if change < 0.0 else ""
-
-
-def _value_text(value: float | bool | str | None) -> str:
-    return "off" if value is None else f"{value:.6g}" if isinstance(value, float) else str(value)

@@ -81,6 +81,11 @@ def units_of(estimator: str, tuning: Tuning) -> dict[str, str]:
     return {key: unit for key, unit in units.items() if unit not in ("", "1")}
 
 
+def value_text(value: float | bool | str | None, none: str = "off") -> str:
+    """Return the value of an entry as text, `none` for None."""
+    return none if value is None else f"{value:.6g}" if isinstance(value, float) else str(value)
+
+
 def in_words(changes: Sequence[SettingChange], most: int = 3, units: Mapping[str, str] = MappingProxyType({})) -> str:
     """Return the first changes in one line: Q.winding 0.01 → 0.1 °C²/s, ekf → ukf, yoke held out."""
 
@@ -88,10 +93,7 @@ def in_words(changes: Sequence[SettingChange], most: int = 3, units: Mapping[str
         key, none = change.key, "never" if change.key == "gate.reopen" else "off"
         if key.startswith("use."):
             return f"{key[4:]} {'used' if change.after else 'held out'}"
-        before, after = (
-            none if value is None else f"{value:.6g}" if isinstance(value, float) else str(value)
-            for value in (change.before, change.after)
-        )
+        before, after = (value_text(value, none) for value in (change.before, change.after))
         name = "" if key == "estimator" else f"{key.removeprefix('options.')} "
         return f"{name}{before} → {after} {units.get(key, '')}".rstrip()
 
