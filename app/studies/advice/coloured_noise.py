@@ -14,6 +14,7 @@ from typing import NamedTuple
 
 import numpy as np
 
+from config.yaml_files import rounded
 from estimators.diagnostics.calibration import LIMITS, Calibration
 from estimators.errors import ModelError, NisusError
 from estimators.fit.entries import entries_of
@@ -239,16 +240,12 @@ def _sections(trial: _Trial) -> dict[str, dict[str, object]]:
     for each in trial.appended:
         over = f"{_time(trial.tuning, each):.3g} s"
         if each.noise is not None:
-            found[f"noise.{each.noise}"] = {"variance": _figure(trial.tuning.get(f"Q.{each.noise}")), "over": over}
+            found[f"noise.{each.noise}"] = {"variance": rounded(trial.tuning.get(f"Q.{each.noise}"), 3), "over": over}
         elif each.sensor is not None:
             sensor = trial.fold.model.sensors[trial.fold.model.sensor_names.index(each.sensor)]
             white, error = f"R.{sensor.rows[0].name}", f"Q.{errors_of(sensor)[0]}"
             found[f"sensors.{each.sensor}"] = {
-                "variance": _figure(trial.tuning.get(white)),
-                "error": {"variance": _figure(trial.tuning.get(error)), "over": over},
+                "variance": rounded(trial.tuning.get(white), 3),
+                "error": {"variance": rounded(trial.tuning.get(error), 3), "over": over},
             }
     return found
-
-
-def _figure(value: object) -> float:
-    return float(f"{float(value):.3g}")  # type: ignore[arg-type]
