@@ -185,11 +185,12 @@ def _assembled(model: StateSpaceModel, loaded: Loaded) -> StateSpaceModel:
     values |= {name: _value(name, section) for name, section in sections.items() if name not in values}
     check_names(loaded, ("estimate",), config.estimate, [*values, *times], "parameter", model)
     estimated = {name: JointParameter(section.std, section.drift) for name, section in config.estimate.items()}
-    own = _instrument_keys(config, instruments)
+    own: dict[str, Key] = {name: ("parameters", name) for name in sections} | _instrument_keys(config, instruments)
+    uncertain: dict[str, Key] = {**own, **{name: ("estimate", name) for name in config.estimate}}
     for name, section in sections.items():
         std = section.spread(values[name])
         if std == 0.0 and section.std is not None:
-            at: Key = (*own.get(name, ("parameters", name)), "std")
+            at: Key = (*own[name], "std")
             raise loaded.error(at, f"is {section.std} of {values[name]:g}; give it in the unit of the value")
         if std is not None:
             if name in config.estimate:
@@ -205,12 +206,13 @@ def _assembled(model: StateSpaceModel, loaded: Loaded) -> StateSpaceModel:
             mirrored = sections[other].correlation.get(name, value) if other in sections else value
             if name == other or mirrored != value:
                 text = "is with itself" if name == other else f"is {value:g} here and {mirrored:g} under {other}"
-                at = (*own.get(name, ("parameters", name)), "correlation", other)
+                at = (*own[name], "correlation", other)
                 raise loaded.error(at, f"{text}; give each pair once")
     if estimated and isinstance(model.states, Field):
         name = next(iter(estimated))
-        at = ("estimate", name) if name in config.estimate else own.get(name, ("parameters", name))
-        raise loaded.error(at, f"is uncertain, and {model.name} is a field, whose parameters are held; give no std")
+        raise loaded.error(
+            uncertain[name], f"is uncertain, and {model.name} is a field, whose parameters are held; give no std"
+        )
     held = {name for name, section in sections.items() if section.use != "considered"}
     correlations = {
         (name, other): value
@@ -241,7 +243,7 @@ def _assembled(model: StateSpaceModel, loaded: Loaded) -> StateSpaceModel:
         keys = {
             "noise": ("noise", name, "over"),
             "error": ("sensors", name, "error"),
-            "estimate": ("estimate", name) if name in config.estimate else own.get(name, ("parameters", name)),
+            "estimate": uncertain.get(name, ()),
             "correlation": ("parameters",),
             "instrument": ("sensors" if name in config.sensors else "inputs", name),
         }
