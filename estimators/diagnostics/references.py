@@ -128,7 +128,7 @@ def own_grades(model: StateSpaceModel, track: Track, u: np.ndarray) -> dict[str,
         if track.flags[-1] & memory_flag(k)
     }
     return grades | {
-        state.name: (WITHHELD, f"{why}, ± {_two_digits(HALF_WIDTH * deviation)}{spaced(state.unit)}")
+        state.name: (WITHHELD, f"{why}, ± {float(f'{HALF_WIDTH * deviation:.2g}'):g}{spaced(state.unit)}")
         for state, deviation, without in zip(model.shown_states, std, withheld(model, track)[-1], strict=True)
         if without
     }
@@ -137,10 +137,6 @@ def own_grades(model: StateSpaceModel, track: Track, u: np.ndarray) -> dict[str,
 def withheld_reasons(own: Mapping[str, tuple[str, str]]) -> dict[str, str]:
     """Return the reason of each withheld state among those of `own_grades`."""
     return {name: reason for name, (grade, reason) in own.items() if grade == WITHHELD}
-
-
-def _two_digits(value: float) -> str:
-    return f"{float(f'{value:.2g}'):g}"
 
 
 def references(model: StateSpaceModel, events: Events, track: Track) -> list[Reference]:

@@ -124,7 +124,9 @@ def find_repeats(t: np.ndarray, values: np.ndarray) -> Finding:
     if repeated:
         return _steps(values, d, step)
     line = _line(t, values, d, place, step)
-    if line is None and repeated is None and (changes.size < MIN_CHANGES or _mostly_apart(place[changes])):
+    # A hold is possible if few changes are in neighbouring rows.
+    held = changes.size < MIN_CHANGES or np.mean(np.diff(place[changes]) == 1) <= 1.0 - MIN_PERIODIC
+    if line is None and repeated is None and held:
         return Finding(UNDECIDED, reason="its values are too coarse")
     return line or Finding(SINGLE)
 
@@ -223,11 +225,6 @@ def _multiples(runs: np.ndarray, period: float) -> tuple[np.ndarray, np.ndarray]
     """Return the distance of runs to the next multiple of the period, and these multiples."""
     multiple = np.maximum(np.rint(runs / period), 1.0)
     return np.abs(runs - multiple * period), multiple
-
-
-def _mostly_apart(place: np.ndarray) -> bool:
-    """Return whether few changes are in neighbouring rows, so that a hold is possible."""
-    return bool(np.mean(np.diff(place) == 1) <= 1.0 - MIN_PERIODIC)
 
 
 def _steps(values: np.ndarray, d: np.ndarray, step: float) -> Finding:

@@ -259,15 +259,11 @@ def _judged(track: Track, k: int) -> np.ndarray:
     return np.where(judged, standardised(track, k, False), np.nan)
 
 
-def _at_most(most: float) -> str:
-    return f"less than {MIN_DIFFERENCE:g} σ" if most < MIN_DIFFERENCE else f"at most {digits(most)} σ"
-
-
 def _in_words(exact: bool, apart: tuple[Curvature, ...], bad: list[White]) -> str:
     worst = max(apart, key=lambda item: item.most)
+    most = f"less than {MIN_DIFFERENCE:g} σ" if worst.most < MIN_DIFFERENCE else f"at most {digits(worst.most)} σ"
     figure = (
-        f"{100 * DIFFERENCE_QUANTILE:.0f} % of the time {LINEARISED} and {UNSCENTED} are {_at_most(worst.most)} apart "
-        f"({worst.name})"
+        f"{100 * DIFFERENCE_QUANTILE:.0f} % of the time {LINEARISED} and {UNSCENTED} are {most} apart ({worst.name})"
     )
     if exact:
         figure = f"f and h are linear, so the Kalman filter is exact; {figure}"
