@@ -387,8 +387,7 @@ def _stored_twin(
     )
     runs = [_run_from_json(each, twin) for each in parts["runs"]]
     last = runs[-1]
-    if difference(last.estimator, last.tuning, estimator, tuning):
-        more = difference(last.estimator, last.tuning, estimator, tuning)
+    if more := difference(last.estimator, last.tuning, estimator, tuning):
         runs.append(Revision(last.number + 1, estimator, tuning, time.time(), more, why="files changed"))
     else:
         runs[-1] = replace(last, estimator=estimator, tuning=tuning)

@@ -76,10 +76,9 @@ def badness(name: str, value: float) -> float:
     the density of a measurement.
     """
     kind = name.partition(".")[0]
-    if kind == RMSE:
-        return float(np.log(max(value, np.finfo(float).tiny)))
-    if kind == NIS:
-        return abs(float(np.log(max(value, np.finfo(float).tiny))))
+    if kind in (RMSE, NIS):
+        size = float(np.log(max(value, np.finfo(float).tiny)))
+        return size if kind == RMSE else abs(size)
     if kind == COVERAGE:
         return abs(value - PROBABILITY)
     return -value if kind == LIKELIHOOD else value

@@ -297,10 +297,10 @@ def _verdict(twin: Twin, fitted: Fitted, aim: str, *, written: bool) -> Topic:
 
 def next_step(twin: Twin, fitted: Fitted, aim: str) -> str:
     """Return what to try after a fit by an aim that is not proposed."""
-    name, verdict = named(twin.path), fitted.verdict
+    name, verdict, judged = named(twin.path), fitted.verdict, fitted.before.held_out
     if fitted.stopped:
         return f"run it to its end: nisus tune {name}."
-    if not fitted.before.held_out.n:
+    if not judged.n:
         return "hold blocks out with --blocks 9, so that the fit can be judged."
     if all(line.alone for line in fitted.lines):
         if aim == WITNESSES:
@@ -316,8 +316,8 @@ def next_step(twin: Twin, fitted: Fitted, aim: str) -> str:
             f"the noises of the twin compensate for a model error: fit its parameters too (--fit Q,R,p), look at "
             f"nisus check {name}, or give the error a correlation time (nisus advise {name} tests it)."
         )
-    before, after = fitted.before.held_out.correlation, fitted.after.held_out.correlation
-    row = most_correlated(fitted.before.held_out)
+    before, after = judged.correlation, fitted.after.held_out.correlation
+    row = most_correlated(judged)
     if row and abs(before[row]) > MAX_CORRELATION:
         change = f"{before[row]:+.2f} -> {after.get(row, np.nan):+.2f}"
         if abs(after.get(row, 1.0)) <= MAX_CORRELATION:
@@ -329,6 +329,6 @@ def next_step(twin: Twin, fitted: Fitted, aim: str) -> str:
             f"successive innovations of {row} are correlated ({change}), so a cause is missing: look at nisus advise "
             f"{name}, which tests remedies, or fit parameters too, with --fit Q,R,p."
         )
-    if fitted.before.held_out.nis > 0.0 and abs(np.log(fitted.before.held_out.nis)) < WELL_TUNED:
+    if judged.nis > 0.0 and abs(np.log(judged.nis)) < WELL_TUNED:
         return "nothing: the twin's values already predict the held-out blocks as well."
     return f"give more recordings with --log, or fit other entries, such as --fit Q,R,p; nisus advise {name} helps."

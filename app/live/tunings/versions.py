@@ -244,7 +244,7 @@ def settings_of(twin: Twin, found: Fitted, fitted_on: Sequence[str], note: str =
     tuning, prior = found.setting
     return Settings(
         found.estimator,
-        found.setting.tuning,
+        tuning,
         note,
         tuple(fitted_on),
         _scores(found.after.held_out),

@@ -139,12 +139,13 @@ def styles(
     def band(name: str, color: RGB) -> rr.SeriesLines:
         return rr.SeriesLines(colors=[color, light, light], names=[name, "+2σ", "−2σ"], widths=[2.0, 1.0, 1.0])
 
+    previous = rr.SeriesLines(colors=[grey], names=["previous"], widths=[1.0])
     for state in model.shown_states:
         style(f"/state/{state.name}", band("estimate", palette.estimate))
         dark = rr.SeriesLines(colors=[palette.smoothed] * 3, names=["smoothed", "+2σ", "−2σ"], widths=[1.5, 0.75, 0.75])
         style(f"/smoothed/state/{state.name}", dark)
         style(f"/truth/{state.name}", rr.SeriesLines(colors=[palette.truth], names=["truth"], widths=[1.0]))
-        style(f"/previous/state/{state.name}", rr.SeriesLines(colors=[grey], names=["previous"], widths=[1.0]))
+        style(f"/previous/state/{state.name}", previous)
     dots = {row for rows in measured_by(model).values() for row in rows}
     for name in model.row_names:
         if model.grid is not None and name not in dots:
@@ -166,7 +167,7 @@ def styles(
     style("/nis/reading", rr.SeriesPoints(colors=[light], names=["NIS of a reading"], marker_sizes=[1.5]))
     nis = {"names": ["windowed mean", "95 % low", "95 % high"], "widths": [2.0, 1.0, 1.0]}
     style("/nis/window", rr.SeriesLines(colors=[palette.estimate, palette.bound, palette.bound], **nis))
-    style("/previous/nis", rr.SeriesLines(colors=[grey], names=["previous"], widths=[1.0]))
+    style("/previous/nis", previous)
     for pair in pairs:
         # Rerun's 2D view has y downwards.
         style(f"/pair/{pair_name(model, pair)}/up", rr.Transform3D(scale=[1.0, -1.0, 1.0]))
