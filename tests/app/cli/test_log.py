@@ -119,7 +119,8 @@ def test_a_twin_of_a_recording_folds_as_it_stands(drive, nisus):
     twin = load_twin(path)
     assert set(twin.model.sensor_names) == {"rpm", "temp"}
     # The engine speed is a sine: its rate has a noise that lasts for some of its 31 s.
-    assert twin.model.state_names == ("temp", "rpm", "rpm_rate", "rpm_rate_disturbance")
+    offsets = ("temp_offset_deviation", "rpm_offset_deviation")  # of one step of their values
+    assert twin.model.state_names == ("temp", "rpm", "rpm_rate", "rpm_rate_disturbance", *offsets)
     score = nisus("fold", str(path), "--json").json
     assert score["readings"] == 1200 and score["failed"] == 0
     # The temperature is a random walk, 0.3² a step.
