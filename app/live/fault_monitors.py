@@ -12,6 +12,7 @@ from collections.abc import Callable, Sequence
 from math import inf
 from typing import NamedTuple
 
+from estimators.diagnostics.detectors import detector_of
 from estimators.diagnostics.episodes import Episode
 from estimators.diagnostics.sensitivity import bounds_of, sensitivity, smallest_of
 from estimators.diagnostics.sensitivity.responses import SENSOR
@@ -73,8 +74,10 @@ class RootCause:
 
     def with_fault(self, episode: Episode) -> Episode:
         """Return the episode with the most likely fault and, while it lasts, the states not affected, in its text."""
-        words, unaffected = self.fault_behind(episode), self._levels.unaffected.get(episode.subject)
+        words = self.fault_behind(episode)
         text = f"{episode.text}; most likely fault: {words}" if words else episode.text
+        # A state may have the name of a sensor, and episodes without alarms.
+        unaffected = self._levels.unaffected.get(episode.subject) if detector_of(episode.cause).alarms else None
         return episode._replace(text=f"{text}; not affected: {unaffected}" if unaffected and not episode.end else text)
 
     def primary(self, episode: Episode) -> Episode:

@@ -55,9 +55,10 @@ def test_the_status_shows_the_sensitivity_of_the_same_events():
     assert found.reason == "" and found.t == int(log.t[log.n - 1])
     assert_close(found.bounds, bounds_of(MODEL, computed), 1e-12)
     lasting = Episode(60.0, None, "winding", "spiky", 5.0, 1.0, 9.0, "%", "winding has spikes")
-    told = [engine._watchers.root_cause.with_fault(lasting._replace(end=end)).text for end in (None, 70.0)]
+    several = lasting, lasting._replace(end=70.0), lasting._replace(cause="corrected")  # the last, of a state
+    told = [engine._watchers.root_cause.with_fault(episode).text for episode in several]
     # A constant offset of the only sensor is one of the temperature, and none of its rate.
-    assert told == ["winding has spikes; not affected: rate", "winding has spikes"]
+    assert told == ["winding has spikes; not affected: rate", "winding has spikes", "winding has spikes"]
     # Of the one sensor's noise of 2 °C.
     (smallest,) = found.smallest
     size = float(computed.faults[0].visible)
