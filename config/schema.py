@@ -460,7 +460,7 @@ class TwinSection(Section):
     none."""
     valid: dict[str, Validity] = {}
     """Range over which the model was fitted or validated, by state or input, in its unit, for example
-    {temperature: {min: 20, max: 38}}. Outside it health is suspect, or advisory where parameters `widen`. A fitted
+    {temperature: {min: 20, max: 38}}. Outside it, by more than 5 % of its width, health is suspect. A fitted
     tuning version has the range of its recordings. Default: the model's."""
     possible: dict[str, Validity] = {}
     """Physical limits of a state or an estimated parameter, in its unit, for example {level: {min: 0, max: 2.4}}. While

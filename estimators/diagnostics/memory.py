@@ -51,8 +51,8 @@ Memory, memory_of = declare_layout(
     scratch_size,
     count="2",  # measurements of the present time; bits of the states in alarm
     first="3",  # bits of sensors heard; e of a contradicted prior, or 0; bits of the states that are still its own
-    B="n, n",
-    G="n, n",
+    B="n, n",  # Φ P₀ Φᵀ of a contradicted prior
+    G="n, n",  # variance that measurements have taken from a forecast since
     now="Time(at, n)",
     joined="Time(at, n)",
     x="n",
