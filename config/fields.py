@@ -366,7 +366,17 @@ Ranges = Annotated[
     BeforeValidator(_as_pairs, json_schema_input_type=Pair | list[Pair]),
     AfterValidator(_rising),
 ]
-Validity = Annotated[RangeSection, AfterValidator(_holds_something)]
+Limited = Annotated[RangeSection, AfterValidator(_holds_something)]
+
+
+class ValiditySection(RangeSection):
+    """A range of validity, its ends included."""
+
+    extrapolate: Positive | None = None
+    """Distance by which the model holds beyond the range. Default: 5 % of its width."""
+
+
+Validity = Annotated[ValiditySection, AfterValidator(_holds_something)]
 
 
 def bounds(pair: Pair) -> tuple[float, float]:

@@ -18,6 +18,7 @@ from .fields import (
     Duration,
     ErrorSection,
     Flag,
+    Limited,
     NoiseSection,
     NotNegative,
     Number,
@@ -460,9 +461,9 @@ class TwinSection(Section):
     none."""
     valid: dict[str, Validity] = {}
     """Range over which the model was fitted or validated, by state or input, in its unit, for example
-    {temperature: {min: 20, max: 38}}. Outside it, by more than 5 % of its width, health is suspect. A fitted
+    {temperature: {min: 20, max: 38}}. Outside it, by more than `extrapolate`, health is suspect. A fitted
     tuning version has the range of its recordings. Default: the model's."""
-    possible: dict[str, Validity] = {}
+    possible: dict[str, Limited] = {}
     """Physical limits of a state or an estimated parameter, in its unit, for example {level: {min: 0, max: 2.4}}. While
     the band of its estimate lies beyond, health is suspect; a forecast ends there. Default: the model's; kelvins and
     kilograms are at least 0, unless the prior's mean is within 2 standard deviations of it."""

@@ -12,6 +12,7 @@ import shutil
 import subprocess
 import sys
 import tempfile
+from glob import glob
 from pathlib import Path
 
 ROOT = Path(__file__).resolve().parent.parent
@@ -58,7 +59,7 @@ def interpreters() -> dict[tuple[int, int], str]:
     candidates = [sys.executable]
     for minor in MINORS:
         candidates += [found for found in [shutil.which(f"python3.{minor}")] if found]
-        candidates += map(str, sorted(pyenv.glob(f"3.{minor}.*/bin/python")))
+        candidates += sorted(glob(f"{pyenv}/3.{minor}.*/bin/python"))  # nothing of a folder that is not ours
     found: dict[tuple[int, int], str] = {}
     for path in candidates:
         ask = [path, "-c", "import sys, venv; print(*sys.version_info[:2])"]

@@ -370,7 +370,7 @@ def _possible(state: State, loaded: Loaded) -> tuple[float, float] | None:
 
 def _ranged(items: Any, loaded: Loaded) -> Any:
     """Return states or inputs with the YAML's ranges of validity; a field stays."""
-    given, widen = loaded.config.valid, [section.widen for section in loaded.config.parameters.values()]
+    valid, widen = loaded.config.valid, [section.widen for section in loaded.config.parameters.values()]
     if isinstance(items, Field):
         return items
     found = (
@@ -378,7 +378,9 @@ def _ranged(items: Any, loaded: Loaded) -> Any:
         for item in items
     )
     return tuple(
-        replace(item, fitted=bounds((given[item.name].min, given[item.name].max))) if item.name in given else item
+        replace(item, fitted=bounds((own.min, own.max)), near=own.extrapolate)
+        if (own := valid.get(item.name))
+        else item
         for item in found
     )
 

@@ -13,7 +13,6 @@ from ..track import HELD_OUT, MISSING, Track
 from .detectors import (
     ADVISORY_ALARM,
     AT_REPETITION,
-    FAR,
     GAINS,
     JOINT,
     LOST,
@@ -92,7 +91,7 @@ def detector_context(
     items: tuple[State | Input, ...] = (*model.shown_states, *model.inputs)
     for own, item in zip(ranges, items, strict=True):
         if item.fitted is not None:
-            own[:2] = beyond_range(item.fitted), beyond_range(item.fitted, FAR, item.far)
+            own[:2] = beyond_range(item.fitted, item.near, item.far)
     counts = np.array([len(sensor.rows) for sensor in model.sensors], np.int64)
     by_chance = [sensor.by_chance for sensor in model.sensors]
     return {

@@ -364,10 +364,15 @@ range in which the model was fitted, and by half of it; an impossible estimate."
 MARGIN, FAR = 0.05, 0.5  # Share of its width by which a range is left before that counts, and before it is far
 
 
-def beyond_range(limits: tuple[float, float], share: float = MARGIN, far: float | None = None) -> tuple[float, float]:
-    """Return a range that is wider on both sides, by a share of its width or by a distance."""
-    more = share * (limits[1] - limits[0]) if far is None else far
-    return limits[0] - more, limits[1] + more
+def beyond_range(limits: tuple[float, float], near: float | None, far: float | None) -> list[tuple[float, float]]:
+    """Return the ranges beyond which an item is outside its own, and far outside, wider on both sides by a distance.
+
+    Default: a share of the width; of a range with one end none, and nothing is far outside.
+    """
+    width = limits[1] - limits[0] if limits[1] - limits[0] < math.inf else 0.0
+    near = MARGIN * width if near is None else near
+    far = max(FAR * width or math.inf if far is None else far, near)
+    return [(limits[0] - more, limits[1] + more) for more in (near, far)]
 
 
 SENSOR_FLAGS = 42  # Sensors with a bit of their own in `Track.flags`, the lowest; the others share the last

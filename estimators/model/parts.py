@@ -19,11 +19,11 @@ class State:
     """One entry of x with its prior N(mean, std²); a `circular` one is an angle in radians and wraps to ±π.
 
     `position` is for filters that localise measurements. `fitted` is the range in which the model was fitted or
-    checked; an estimate outside makes the twin suspect. `withhold` is the half-width of its 95 % band beyond which it
-    is not shown as an estimate; nor is it where a state or an input is `far` or more outside its range (default: half
-    of its width). `limits` are its physical limits: no error is larger than the distance between them. An `appended`
-    one is a parameter or an error, whose corrections are not judged; a `watched` one makes the twin suspect when its
-    own corrections are too large.
+    checked; an estimate outside by more than `near` (default: 5 % of its width) makes the twin suspect. `withhold` is
+    the half-width of its 95 % band beyond which it is not shown; nor is it where a state or an input is `far` or more
+    outside its range (default: half of its width). `limits` are its physical limits: no error is larger than the
+    distance between them. An `appended` one is a parameter or an error, whose corrections are not judged; a `watched`
+    one makes the twin suspect when its own corrections are too large.
     """
 
     name: str
@@ -34,6 +34,7 @@ class State:
     position: tuple[float, ...] | None = None
     fitted: tuple[float, float] | None = None
     withhold: float = math.inf
+    near: float | None = None
     far: float | None = None
     limits: tuple[float, float] | None = None
     appended: bool = False

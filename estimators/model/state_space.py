@@ -46,12 +46,13 @@ class Noise:
 
 @dataclass(frozen=True)
 class Input:
-    """One entry of u, held until it changes; `default` before the first value; `fitted`, `far` as in `State`."""
+    """One entry of u, held until it changes; `default` before the first value; the ranges are those of `State`."""
 
     name: str
     unit: str
     default: float = 0.0
     fitted: tuple[float, float] | None = None
+    near: float | None = None
     far: float | None = None
 
     def __post_init__(self) -> None:

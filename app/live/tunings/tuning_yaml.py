@@ -130,7 +130,7 @@ def _fitted_ranges(
     limited |= {place for section in parameter_sections(model, config).values() for place in section.widen}
     for name in sorted(limited & set(widths.envelope)):
         low, high = widths.envelope[name]
-        found[name] = rounded({"min": low, "max": high})
+        found.setdefault(name, {}).update(rounded({"min": low, "max": high}))
     return found
 
 

@@ -85,6 +85,12 @@ def test_an_estimate_with_too_wide_a_band_is_withheld(tmp_path, nisus):
     assert all(sum(state["share"].values()) == pytest.approx(1.0) for state in states.values())
 
 
+@pytest.mark.parametrize("limits, grade", [("max: 20", "suspect"), ("max: 20, extrapolate: 40", "tracking")])
+def test_a_range_may_have_one_end_and_be_extrapolated(tmp_path, nisus, limits, grade):
+    path = drive(tmp_path, text=DRIVE + f"valid: {{temperature: {{{limits}}}}}\n")
+    assert nisus("fold", path, "--json").json["states"]["temperature"]["grade"] == grade
+
+
 def test_the_reason_of_a_withheld_estimate_names_what_left_the_fitted_range(tmp_path, nisus):
     limits = "withhold: {rate: 1e-3}\nvalid: {temperature: {min: -10, max: 20}}\n"
     path = drive(tmp_path, text=DRIVE + limits)

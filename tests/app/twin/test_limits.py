@@ -67,9 +67,11 @@ def test_limits_reach_the_sensor(limits, expected):
 
 
 def test_ranges_take_the_place_of_the_models():
-    twin = twin_of(limited("use: true", "valid: {temperature: {min: 0, max: 150}}\npossible: {rate: {min: -9}}"))
+    valid = "valid: {temperature: {min: 0, max: 150, extrapolate: 20}}"
+    twin = twin_of(limited("use: true", f"{valid}\npossible: {{rate: {{min: -9}}}}"))
     temperature, rate = twin.model.states
-    assert (temperature.fitted, temperature.limits, rate.limits) == ((0.0, 150.0), None, (-9.0, np.inf))
+    assert (temperature.fitted, temperature.near, temperature.limits) == ((0.0, 150.0), 20.0, None)
+    assert rate.limits == (-9.0, np.inf)
     # An absolute temperature is not negative, as its prior says; a difference of two may be.
     model, loaded = replace(twin.model, states=(replace(temperature, unit="K"), replace(rate, unit="K"))), twin.loaded
     loaded = replace(loaded, config=loaded.config.model_copy(update={"possible": {}}))
