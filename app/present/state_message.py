@@ -13,7 +13,7 @@ from typing import Annotated, Any, Literal
 import numpy as np
 from pydantic import BaseModel, ConfigDict, Field, model_validator
 
-from estimators.diagnostics.detectors import CALENDAR_FROM_S
+from estimators.diagnostics.detectors import CALENDAR_FROM_S, is_outside
 from estimators.model.parts import State
 from estimators.track import DEGRADED, GATED, HEALTH_NAMES, MISSING, SUSPECT, USABLE, USED
 
@@ -189,7 +189,7 @@ def state_schema() -> dict[str, Any]:
 def _input(item: Any, value: float) -> PublishedInput:
     low, high = item.fitted or (-math.inf, math.inf)
     why = "" if math.isfinite(value) else "the input is not a number"
-    if not why and not low <= value <= high:
+    if not why and is_outside(item, value):
         why = f"outside {low:.4g} to {high:.4g}, where the model was fitted"
     return PublishedInput(name=item.name, unit=item.unit, value=number_or_none(value), valid=not why, reason=why)
 

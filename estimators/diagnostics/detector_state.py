@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 
 from ..events.batch import READING, Events
-from ..model.state_space import Input, State, StateSpaceModel
+from ..model.state_space import StateSpaceModel
 from ..numerics.jit import floats, inlined, part
 from ..track import HELD_OUT, MISSING, Track
 from .detectors import (
@@ -79,19 +79,16 @@ def detector_context(
         expected: Sensors that must report, (sensors,); None for those that have reported. None that reports by chance.
 
     Returns:
-        `baseline` (rows, 3 + TESTS); `normal` (sensors, 3), see `normal_nis`; `ranges` (shown + inputs, 3, 2), in
-        which the model was fitted, with `MARGIN` and as far as `FAR`, and physical limits; `fitted`, 1 if there is any;
-        `expected` (sensors,): 1 for one that must report, -1 by chance, else 0;
-        `chances` (2,), log Λ of a rejected and of an accepted measurement; `gated`, whether outliers are rejected;
-        `marginal`; `n_tests` in all.
+        `baseline` (rows, 3 + TESTS); `normal` (sensors, 3), see `normal_nis`; `ranges` (shown + inputs, 3, 2), of
+        `beyond_range`, and physical limits; `fitted`, 1 if there is any; `expected` (sensors,): 1 for one that must
+        report, -1 by chance, else 0; `chances` (2,), log Λ of a rejected and of an accepted measurement; `gated`,
+        whether outliers are rejected; `marginal`; `n_tests` in all.
     """
     ranges = np.full((len(model.shown) + model.nu, 3, 2), [-np.inf, np.inf])
-    for k, state in enumerate(model.shown_states):
-        ranges[k, 2] = state.limits or ranges[k, 2]
-    items: tuple[State | Input, ...] = (*model.shown_states, *model.inputs)
-    for own, item in zip(ranges, items, strict=True):
-        if item.fitted is not None:
-            own[:2] = beyond_range(item.fitted, item.near, item.far)
+    for own, state in zip(ranges, model.shown_states, strict=False):
+        own[:] = *beyond_range(state), state.limits or own[2]
+    for own, item in zip(ranges[len(model.shown) :], model.inputs, strict=True):
+        own[:2] = beyond_range(item)
     counts = np.array([len(sensor.rows) for sensor in model.sensors], np.int64)
     by_chance = [sensor.by_chance for sensor in model.sensors]
     return {

@@ -22,6 +22,8 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
+from ..model.state_space import Input, State
+
 Ratio = tuple[float, float, float, float, float]
 
 
@@ -364,15 +366,19 @@ range in which the model was fitted, and by half of it; an impossible estimate."
 MARGIN, FAR = 0.05, 0.5  # Share of its width by which a range is left before that counts, and before it is far
 
 
-def beyond_range(limits: tuple[float, float], near: float | None, far: float | None) -> list[tuple[float, float]]:
-    """Return the ranges beyond which an item is outside its own, and far outside, wider on both sides by a distance.
+def beyond_range(item: State | Input) -> list[tuple[float, float]]:
+    """Return the ranges beyond which a state or input is outside that of its model, and far outside."""
+    low, high = item.fitted or (-math.inf, math.inf)
+    width = high - low if high - low < math.inf else 0.0  # with one end no margin, and nothing is far outside
+    near = MARGIN * width if item.near is None else item.near
+    far = max(FAR * width or math.inf if item.far is None else item.far, near)
+    return [(low - more, high + more) for more in (near, far)]
 
-    Default: a share of the width; of a range with one end none, and nothing is far outside.
-    """
-    width = limits[1] - limits[0] if limits[1] - limits[0] < math.inf else 0.0
-    near = MARGIN * width if near is None else near
-    far = max(FAR * width or math.inf if far is None else far, near)
-    return [(limits[0] - more, limits[1] + more) for more in (near, far)]
+
+def is_outside(item: State | Input, value: float) -> bool:
+    """Return whether a value makes the twin suspect, or is not a number."""
+    low, high = beyond_range(item)[0]
+    return not low <= value <= high
 
 
 SENSOR_FLAGS = 42  # Sensors with a bit of their own in `Track.flags`, the lowest; the others share the last

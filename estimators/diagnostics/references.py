@@ -12,7 +12,7 @@ from ..events.batch import Events, truth_of
 from ..model.state_space import Input, State, StateSpaceModel
 from ..numerics.linalg import wrapped
 from ..track import HEALTH_NAMES, HELD_OUT, SUSPECT, WAITING, Track
-from .detectors import FAR_OUTSIDE, memory_flag
+from .detectors import FAR_OUTSIDE, is_outside, memory_flag
 
 
 class Reference(NamedTuple):
@@ -113,13 +113,11 @@ def own_grades(model: StateSpaceModel, track: Track, u: np.ndarray) -> dict[str,
         track: Rows of a fold, at least one.
         u: Inputs at the last of them (nu,).
     """
-    mean, std = track.mean[-1], track.std[-1]
     items: tuple[State | Input, ...] = (*model.shown_states, *model.inputs)
-    places = [(item.name, item.unit, item.fitted) for item in items]
     left = [
-        f"{name} {value:.4g}{spaced(unit)}, fitted at {limits[0]:.4g} to {limits[1]:.4g}"
-        for (name, unit, limits), value in zip(places, (*mean, *u), strict=True)
-        if limits is not None and not limits[0] <= value <= limits[1]
+        f"{item.name} {value:.4g}{spaced(item.unit)}, fitted at {item.fitted[0]:.4g} to {item.fitted[1]:.4g}"
+        for item, value in zip(items, (*track.mean[-1], *u), strict=True)
+        if item.fitted is not None and is_outside(item, value)
     ]
     why = f"outside the fitted range ({'; '.join(left)})" if left else "too uncertain"
     grades = {
@@ -129,7 +127,7 @@ def own_grades(model: StateSpaceModel, track: Track, u: np.ndarray) -> dict[str,
     }
     return grades | {
         state.name: (WITHHELD, f"{why}, ± {float(f'{HALF_WIDTH * deviation:.2g}'):g}{spaced(state.unit)}")
-        for state, deviation, without in zip(model.shown_states, std, withheld(model, track)[-1], strict=True)
+        for state, deviation, without in zip(model.shown_states, track.std[-1], withheld(model, track)[-1], strict=True)
         if without
     }
 

@@ -103,9 +103,8 @@ def left_ranges(judged: JudgedRows) -> Iterator[FoundEpisode]:
 
 
 def _outside(item: State | Input, value: np.ndarray, t: np.ndarray) -> Iterator[FoundEpisode]:
-    if item.fitted is not None:
-        low, high = beyond_range(item.fitted, item.near, item.far)[0]
-        yield from _beyond(item, "outside", (value < low) | (value > high), value, t, item.fitted)
+    low, high = beyond_range(item)[0]
+    yield from _beyond(item, "outside", (value < low) | (value > high), value, t, item.fitted or (low, high))
 
 
 def _beyond(

@@ -85,10 +85,13 @@ def test_an_estimate_with_too_wide_a_band_is_withheld(tmp_path, nisus):
     assert all(sum(state["share"].values()) == pytest.approx(1.0) for state in states.values())
 
 
-@pytest.mark.parametrize("limits, grade", [("max: 20", "suspect"), ("max: 20, extrapolate: 40", "tracking")])
-def test_a_range_may_have_one_end_and_be_extrapolated(tmp_path, nisus, limits, grade):
-    path = drive(tmp_path, text=DRIVE + f"valid: {{temperature: {{{limits}}}}}\n")
-    assert nisus("fold", path, "--json").json["states"]["temperature"]["grade"] == grade
+@pytest.mark.parametrize(
+    "limits, grade, why", [("max: 20", "suspect", "outside"), ("max: 20, extrapolate: 40", "tracking", "too uncertain")]
+)
+def test_a_range_may_have_one_end_and_be_extrapolated(tmp_path, nisus, limits, grade, why):
+    path = drive(tmp_path, text=DRIVE + f"withhold: {{rate: 1e-3}}\nvalid: {{temperature: {{{limits}}}}}\n")
+    found = nisus("fold", path, "--json").json["states"]
+    assert found["temperature"]["grade"] == grade and found["rate"]["reason"].startswith(why)
 
 
 def test_the_reason_of_a_withheld_estimate_names_what_left_the_fitted_range(tmp_path, nisus):

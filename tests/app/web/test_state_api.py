@@ -15,9 +15,9 @@ from prometheus_client.parser import text_string_to_metric_families
 from pydantic import ValidationError
 from starlette.routing import Route
 
-from app.present.state_message import PublishedState, StateMessage, state_message, state_schema
+from app.present.state_message import PublishedState, StateMessage, _input, state_message, state_schema
 from app.web.http import ApiRoute
-from estimators import fuse
+from estimators import Input, fuse
 from estimators.track import DEGRADED, DIVERGED, STALE, SUSPECT, WAITING
 from tests.app.scripted import pull_all, readings
 from tests.cases import cases
@@ -254,3 +254,8 @@ def test_the_description_of_the_api_has_every_path_and_is_true(page):
     check(command, {"command": "Reset"})
     with pytest.raises(jsonschema.ValidationError):
         check(command, {"command": "SetTuning", "value": 1.0})
+
+
+@pytest.mark.parametrize("value, valid", [(14.9, False), (15.1, True)])
+def test_an_input_is_valid_as_far_as_its_model_holds(value, valid):
+    assert _input(Input("air", "°C", fitted=(20.0, 30.0), near=5.0), value).valid == valid
