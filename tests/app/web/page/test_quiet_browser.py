@@ -23,7 +23,7 @@ def session():
 
 def streams(session):
     """Columns of each open chart stream."""
-    return {stream.name: set(stream.query.columns) for stream in session.running.server.series.streams}
+    return {stream.name: set(stream.query.columns) for stream in session.running.server.series.streams.copy()}
 
 
 def test_the_charts_go_to_another_moment_of_the_stretch_that_they_show(page, session):
