@@ -154,7 +154,8 @@ def fold_event(
     track.verdict[i] = verdict
     track.effective[i] = score[EFFECTIVE]
     track.ancestors[i] = score[ANCESTORS]
-    track.flags[i] = memory_flags(memory, context.nx) if memory != 0 else 0
+    track.factor[i] = 1.0
+    track.flags[i] = memory_flags(context, memory, track.factor[i]) if memory != 0 else 0
     for j in range(whitened.shape[1]):
         whitened[i, j] = score[WHITENED + j]
     return asked

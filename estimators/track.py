@@ -51,7 +51,8 @@ class Track(NamedTuple):
     the measurement or state of the truth; flags: bits of other conditions (diagnostics/detectors.py).
     screened (N, ny): bits of `REASONS` for which a row of the measurement was rejected before the filter. effective:
     effective sample size of particles after a used measurement, before resampling; ancestors: number of particles some
-    measurements ago from which these descend (particle/); NaN elsewhere.
+    measurements ago from which these descend (particle/); NaN elsewhere. factor (N, nx): by how much more than its std
+    a state has been corrected, while its memory is in alarm (diagnostics/memory.py), else 1.
     """
 
     mean: Any
@@ -75,11 +76,12 @@ class Track(NamedTuple):
     screened: Any
     effective: Any
     ancestors: Any
+    factor: Any
 
     @staticmethod
     def allocate(rows: int, nx: int, pairs: int, ny: int, width: int | None = None) -> Track:
         """Allocate columns for `rows` events; a row has values, and memory, once its event is folded."""
-        widths = iter((nx, nx, pairs, ny, ny, ny, width or ny, ny))
+        widths = iter((nx, nx, pairs, ny, ny, ny, width or ny, ny, nx))
         shapes = ((rows, next(widths)) if kind.ndim == 2 else rows for kind in track_type.types)
         return Track(*(np.empty(shape, str(kind.dtype)) for shape, kind in zip(shapes, track_type.types, strict=True)))
 
@@ -117,7 +119,7 @@ Track._make = classmethod(lambda cls, columns: cls(*columns))  # type: ignore[me
 
 _A1, _A2, _B2 = types.int32[::1], types.Array(types.int32, 2, "C"), types.Array(types.int8, 2, "C")
 track_type = types.NamedTuple(
-    (F2, F2, F2, F2, F2, F1, F1, _A1, B1, F1, F1, F1, F1, B1, B1, F2, _A2, I1, _B2, F1, F1), Track
+    (F2, F2, F2, F2, F2, F1, F1, _A1, B1, F1, F1, F1, F1, B1, B1, F2, _A2, I1, _B2, F1, F1, F2), Track
 )
 
 

@@ -165,7 +165,9 @@ def guard_log(guarded: GuardedLog, note: str | None = None, overrides: Mapping[s
         verdict = replace(verdict, version=twin.tuning.name)
         known = read_baseline(guarded.reference)
         if known is None and note is None:
-            words = named(guarded.twin) if guarded.recording is None else _folder_option(guarded.recording)
+            words = (
+                named(guarded.twin) if (held := guarded.recording) is None else f"--archive {shown_path(held.parent)}"
+            )
             text = f"no figures are recorded; `nisus guard {words} --accept --note ...` records them"
             return replace(verdict, absent=text)
         span = known.span if known is not None else _span(guarded, twin)
@@ -181,10 +183,6 @@ def guard_log(guarded: GuardedLog, note: str | None = None, overrides: Mapping[s
     except NisusError as error:
         verdict = replace(verdict, failure=str(error))
     return replace(verdict, seconds=time.monotonic() - begun)
-
-
-def _folder_option(recording: Path) -> str:
-    return f"--archive {shown_path(recording.parent)}"
 
 
 def twin_of(guarded: GuardedLog, overrides: dict[str, str] | None = None) -> Twin:

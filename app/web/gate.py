@@ -333,14 +333,10 @@ class Gate:
 
         async def send_more(message: Message) -> None:
             if message["type"] == "http.response.start":
-                MutableHeaders(scope=message).append("set-cookie", self._marked_cookie)
+                MutableHeaders(scope=message).append("set-cookie", _marked(self._cookie))
             await send(message)
 
         return send_more
-
-    @property
-    def _marked_cookie(self) -> str:
-        return _marked(self._cookie)
 
     def _exchange(self, same_site: bool, cookie: str) -> ASGIApp:
         """Move the token from the address into a cookie."""

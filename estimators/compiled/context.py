@@ -145,12 +145,6 @@ def sensor_rows(context, sensor):
 
 
 @part
-def row_count(context, sensor):
-    """Return the number of rows of a sensor."""
-    return ints(context.row_count, context.n_sensors)[sensor]
-
-
-@part
 def sensor_variances(context, sensor):
     """Return r (ny,), the variances of one sensor's rows."""
     first, count = sensor_rows(context, sensor)

@@ -61,8 +61,6 @@ def offsets(events: Events, track: Track, tuning: Tuning) -> list[Offset]:
         tuning: Tuning of the track.
     """
     model, found = tuning.model, []
-    if bool(np.all(tuning.used)):
-        return []
     held = (events.kind == READING) & (track.verdict == HELD_OUT)
     for s in np.flatnonzero(~tuning.used.astype(bool)):
         rows = np.flatnonzero(held & (events.channel == s))[-LAST_MEASUREMENTS:]

@@ -43,7 +43,7 @@ BEYOND = np.log(100.0)  # log Λ from which a state is in alarm, until it is hal
 COVARIANCE, FACTOR = 1, 2  # What follows the mean in the state of a filter
 
 Time, time_of = declare_layout("Time", "n", Phi="n, n", D="n, n", d="n")
-Level, level_of = declare_layout("Level", "n", time_of, last="Time(at, n)", W="n", rho="n", kept="2")
+Level, level_of = declare_layout("Level", "n", time_of, last="Time(at, n)", W="n", rho="n", excess="n", kept="2")
 Memory, memory_of = declare_layout(
     "Memory",
     "n",
@@ -66,7 +66,7 @@ Memory, memory_of = declare_layout(
 @inlined
 def level_words(n):
     """Return the float64s of a level."""
-    return 2 * n * n + 3 * n + 2
+    return 2 * n * n + 4 * n + 2
 
 
 def memory_context(estimator: Estimator, model: StateSpaceModel, followed: int) -> dict[str, int]:
@@ -137,6 +137,7 @@ def forget_memory(at, n):
         level.kept[:] = 0.0
         level.W[:] = 0.0
         level.rho[:] = 0.0
+        level.excess[:] = 0.0
 
 
 @part
@@ -228,21 +229,27 @@ def _weigh_prior(context, own):
 
 
 @inlined
-def memory_flags(at, n):
-    """Return the bits of `Track.flags` of the states in alarm."""
-    own = memory_of(at, n)
-    return (int(own.count[1]) | int(own.first[2])) << MEMORY_AT
+def memory_flags(context, at, factor):
+    """Return the bits of `Track.flags` of the states in alarm, and set the `Track.factor` of each."""
+    own, shown = memory_of(at, context.nx), shown_states(context)
+    bits = int(own.count[1])
+    for s in range(min(shown.size, MEMORY_FLAGS)):
+        if bits >> s & 1 != 0:
+            factor[s] = np.sqrt(1.0 + _judged(own, context.nx, shown[s])[1])
+    return (bits | int(own.first[2])) << MEMORY_AT
 
 
 @inlined
 def _judged(own, n, j):
-    """Return the largest W of state j over the times that are its memory."""
-    most = 0.0
+    """Return the largest W of state j over the times that are its memory, and the mean of z² - 1 there, at least 0."""
+    most = excess = 0.0
     for k in range(LEVELS):
         level = level_of(own.end + 8 * k * level_words(n), n)
         if LOW < level.rho[j] < HIGH:  # ρ is 0 until two times of the level have ended
             most = max(most, level.W[j])
-    return most
+            if level.W[j] >= 0.5 * BEYOND:
+                excess = max(excess, level.excess[j])
+    return most, excess
 
 
 @part
@@ -296,6 +303,7 @@ def _weigh(time, P, estimated, level):
             # Half of each time is in the one before, too.
             gained = 0.25 * (1.0 - 1.0 / VARIANCE) * z * z - 0.25 * np.log(VARIANCE)
             level.W[j] = min(max(level.W[j] + gained, 0.0), 2.0 * BEYOND)
+            level.excess[j] += 0.25 * (z * z - 1.0 - level.excess[j])
     return True
 
 
@@ -305,6 +313,6 @@ def _in_alarm(context, own, before):
     bits, shown = 0, shown_states(context)
     for s in range(min(shown.size, MEMORY_FLAGS)):
         beyond = 0.5 * BEYOND if before >> s & 1 else BEYOND
-        if context.graded >> s & 1 != 0 and _judged(own, context.nx, shown[s]) >= beyond:
+        if context.graded >> s & 1 != 0 and _judged(own, context.nx, shown[s])[0] >= beyond:
             bits |= 1 << s
     return bits

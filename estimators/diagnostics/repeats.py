@@ -38,11 +38,8 @@ MIN_EXACT = 0.9  # Share of the runs of coarse values within such a deviation, a
 MAX_MULTIPLE = 20.0  # Periods of the longest run that is looked at
 MAX_HELD = 0.99  # Share of the holds of one period within the longest one
 MAX_CANDIDATES = 5  # Commonest run lengths that are tried as a period
-MIN_Z, MIN_HELD, MAX_BETWEEN = (
-    7.0,
-    0.98,
-    0.9,
-)  # Of coarse lines: z of the phase of their knots, share of the rows on their chords, and on others
+MIN_Z, MIN_HELD, MAX_BETWEEN = 7.0, 0.98, 0.9
+"""Of coarse lines: z of the phase of their knots, share of the rows on their chords, and on others."""
 MAX_APART, MAX_RANKED = 100, 30_000  # Rows between such knots, and rows in which they are searched
 
 

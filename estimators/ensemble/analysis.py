@@ -26,12 +26,6 @@ from .blocks import regression_at, transform_at
 from .localisation import between_rows, crews, localised
 from .shared import CONSIDER, THREADED_FROM, column_mean, count_ranks, covariance, ensemble, forecast_at, members
 
-
-def side_of(options: Options, ny: int) -> int:
-    """Return the rows of the largest matrix that an analysis factors."""
-    return ny if options.get("radius", 0.0) > 0 else min(ny, members(options))
-
-
 Analysis, analysis_at = declare_layout(
     "Analysis",
     "N, ny, side",
@@ -70,7 +64,8 @@ def work_size(options: Options, nx: int, ny: int, task: int = 0) -> int:
     )
     # A crew's arrays may begin at its first whole cache line.
     crew += LANES
-    return size_of(analysis_at, N, ny, side_of(options, ny)) + crews(N * nx, THREADED_FROM) * crew
+    side = ny if options.get("radius", 0.0) > 0 else min(ny, N)
+    return size_of(analysis_at, N, ny, side) + crews(N * nx, THREADED_FROM) * crew
 
 
 @jit

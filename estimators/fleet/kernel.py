@@ -96,7 +96,7 @@ _TAKE = {
     "int32, 2": "masks(own[{}], rows, {})",
     "int8, 2": "flag_rows(own[{}], rows, {})",
 }
-_widths = iter("nx nx 0 ny ny ny width ny".split())
+_widths = iter("nx nx 0 ny ny ny width ny nx".split())
 _columns = ", ".join(
     _TAKE[f"{kind.dtype}, {kind.ndim}"].format(k, next(_widths) if kind.ndim == 2 else "")
     for k, kind in enumerate(track_type.types)

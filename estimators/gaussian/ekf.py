@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from ..compiled.context import estimated, expect, options, row_count, transition
+from ..compiled.context import estimated, expect, options, sensor_rows, transition
 from ..compiled.jacobians import scratch_size, sensor_jacobian, state_jacobian
 from ..estimator import TANGENT, Estimator, Options, SmoothingRule
 from ..model.state_space import StateSpaceModel
@@ -185,7 +185,7 @@ def update(context, u, sensor, y, index, state, work, innovation, innovation_std
     Sources: Jazwinski (1970), chapter 8; Bell & Cathey (1993), doi:10.1109/9.250476, for iterations.
     """
     x, P = moments_of(state, context.nx)
-    own = updating(start_of(work), context.nx, row_count(context, sensor))
+    own = updating(start_of(work), context.nx, sensor_rows(context, sensor)[1])
     reading, H = own.reading, own.H
     reading_variances(context, sensor, state, reading.r)
     iterations = int(options(context)[ITERATIONS])

@@ -19,7 +19,7 @@ from functools import lru_cache
 
 import numpy as np
 
-from ..compiled.context import options, row_count, steps_of, transition
+from ..compiled.context import options, sensor_rows, steps_of, transition
 from ..errors import EstimatorError
 from ..estimator import Estimator, Option, Options
 from ..model.parts import covariance_of
@@ -63,7 +63,7 @@ Steady, steady = declare_layout(
 @inlined
 def steady_of(context):
     """Return the steady gain and covariances from `tune`; the model has one sensor."""
-    return steady(start_of(options(context)[STEADY:]), context.nx, row_count(context, 0))
+    return steady(start_of(options(context)[STEADY:]), context.nx, sensor_rows(context, 0)[1])
 
 
 @inlined
@@ -124,7 +124,7 @@ def update(context, u, sensor, y, index, state, work, innovation, innovation_std
     Source: Anderson & Moore (1979), Optimal Filtering, chapter 4; P by the Joseph form, which holds for any gain.
     """
     n = context.nx
-    ny = row_count(context, sensor)
+    ny = sensor_rows(context, sensor)[1]
     x, P = moments_of(state, n)
     phase = phase_of(state)
     own = updating(start_of(work), n, ny)

@@ -6,7 +6,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from ..compiled.context import estimated, expect, row_count, transition
+from ..compiled.context import estimated, expect, sensor_rows, transition
 from ..compiled.jacobians import scratch_size, sensor_jacobian, state_jacobian
 from ..estimator import FACTOR, TANGENT, Options, SmoothingRule
 from ..numerics.jit import by_address, inlined, part
@@ -126,7 +126,7 @@ def update(context, u, sensor, y, index, state, work, innovation, innovation_std
     Source: Kailath, Sayed & Hassibi, Linear Estimation (2000), chapter 12.
     """
     x, U = moments_of(state, context.nx)
-    own = updating(start_of(work), context.nx, row_count(context, sensor))
+    own = updating(start_of(work), context.nx, sensor_rows(context, sensor)[1])
     sensor_jacobian(context, sensor, x, u, own.H, own.jacobian)
     expect(context, sensor, x, u, own.expected)
     bordered = context.n_considered > 0

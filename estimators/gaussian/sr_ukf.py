@@ -13,7 +13,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from ..compiled.context import circular_rows, circular_states, estimated, expect_points, row_count, transition_points
+from ..compiled.context import circular_rows, circular_states, estimated, expect_points, sensor_rows, transition_points
 from ..estimator import FACTOR, POINTS, Options, SmoothingRule
 from ..numerics.jit import by_address, inlined
 from ..numerics.linalg import remove, triangularise
@@ -126,7 +126,7 @@ def update(context, u, sensor, y, index, state, work, innovation, innovation_std
     """
     n = context.nx
     x, U = moments_of(state, n)
-    own = updating(start_of(work), n, row_count(context, sensor))
+    own = updating(start_of(work), n, sensor_rows(context, sensor)[1])
     w = weights_of(context)
     spread_points(x, U, w.spread, own.sigma)
     expect_points(context, sensor, own.sigma, u, own.D)

@@ -19,7 +19,7 @@ from ..compiled.context import (
     estimated,
     expect_points,
     options,
-    row_count,
+    sensor_rows,
     sensor_variances,
     transition_points,
 )
@@ -176,7 +176,7 @@ def update(context, u, sensor, y, index, state, work, innovation, innovation_std
     Source: Julier & Uhlmann (2004), as above; sigma points are drawn again from the prediction, so that they include Q.
     """
     x, P = moments_of(state, context.nx)
-    own = updating(start_of(work), context.nx, row_count(context, sensor))
+    own = updating(start_of(work), context.nx, sensor_rows(context, sensor)[1])
     reading = own.reading
     w = weights_of(context)
     if not factor(P, own.chol_P):

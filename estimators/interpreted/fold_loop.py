@@ -90,6 +90,7 @@ def run(
             score[:] = np.nan
             score[1] = 0.0
             track.flags[i] = 0
+            track.factor[i] = 1.0
             verdict = NONE
             asked = False
             told = state

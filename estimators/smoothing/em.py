@@ -30,7 +30,7 @@ from ..compiled.context import (
     circular_states,
     expect,
     process_variances,
-    row_count,
+    sensor_rows,
     steps_of,
     transition,
 )
@@ -234,7 +234,7 @@ def gather(
                     u[j] = value[i, j]
         if what == READING and verdict[i] == USED:
             sensor = channel[i]
-            m = row_count(context, sensor)
+            m = sensor_rows(context, sensor)[1]
             circular = circular_rows(context, sensor)
             sensor_jacobian(context, sensor, mean[i], u, H[:m], jacobian)
             expect(context, sensor, mean[i], u, expected)

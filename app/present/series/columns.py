@@ -9,9 +9,10 @@ from typing import NamedTuple
 import numpy as np
 
 from estimators.diagnostics.considered_shares import noise_states, noise_std
+from estimators.diagnostics.detectors import MEMORY_FLAGS
 from estimators.diagnostics.references import hidden
 from estimators.log import INPUT, READING, Events, truth_of
-from estimators.model.state_space import StateSpaceModel
+from estimators.model.state_space import State, StateSpaceModel
 from estimators.track import FAILED, GATED, HELD_OUT, USED, Track, estimated_rows
 
 LINE, UPPER, LOWER, DOTS = "line", "upper", "lower", "dots"
@@ -62,7 +63,7 @@ def columns_of(model: StateSpaceModel) -> dict[str, Column]:
             Column(f"mean:{state.name}", LINE, partial(_mean, j, 0.0, withhold=state.withhold)),
             Column(f"upper:{state.name}", UPPER, partial(_mean, j, spread)),
             Column(f"lower:{state.name}", LOWER, partial(_mean, j, -spread)),
-            *_noise_band(model, j, state.name),
+            *_noise_band(model, j, state),
             Column(f"truth:{state.name}", LINE, partial(_truth, int(model.shown[j]))),
         ]
     for name, sensor, row in rows_of(model):
@@ -105,23 +106,26 @@ def units_by_name(model: StateSpaceModel) -> dict[str, str]:
 
 def _mean(j: int, spread: float, rows: Rows, withhold: float = np.inf) -> np.ndarray:
     track = rows.track
-    value = track.mean[:, j] + spread * track.std[:, j] if spread else track.mean[:, j]
+    value = track.mean[:, j] + spread * track.std[:, j] * track.factor[:, j] if spread else track.mean[:, j]
     shown = rows.estimated if withhold == np.inf else rows.estimated & ~hidden(track, j, withhold)
     return np.where(shown, value, np.nan)
 
 
-def _noise_band(model: StateSpaceModel, j: int, name: str) -> list[Column]:
-    """Return the band of a state without the uncertainty of considered parameters; nothing where none is considered."""
-    if j >= noise_states(model):
+def _noise_band(model: StateSpaceModel, j: int, state: State) -> list[Column]:
+    """Return the inner band of a state: without considered parameters; while it is suspect, without its factor."""
+    considered = j < noise_states(model)
+    if not considered and (state.appended or j >= MEMORY_FLAGS):
         return []
 
     def edge(sign: float, rows: Rows) -> np.ndarray:
-        std = noise_std(model, j, rows.track.std, rows.track.cross)
-        return np.where(rows.estimated, rows.track.mean[:, j] + sign * 2.0 * std, np.nan)
+        track = rows.track
+        std = noise_std(model, j, track.std, track.cross) if considered else track.std[:, j]
+        shown = rows.estimated & (considered | (track.factor[:, j] > 1.0))
+        return np.where(shown, track.mean[:, j] + sign * 2.0 * std, np.nan)
 
     return [
-        Column(f"noise_upper:{name}", UPPER, partial(edge, 1.0)),
-        Column(f"noise_lower:{name}", LOWER, partial(edge, -1.0)),
+        Column(f"noise_upper:{state.name}", UPPER, partial(edge, 1.0)),
+        Column(f"noise_lower:{state.name}", LOWER, partial(edge, -1.0)),
     ]
 
 

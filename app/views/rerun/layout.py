@@ -119,11 +119,11 @@ def _stacked(views: list[Any]) -> list[Any]:
     if len(views) <= MAX_VISIBLE_CHARTS:
         return views
     groups = [views[k : k + MAX_VISIBLE_CHARTS] for k in range(0, len(views), MAX_VISIBLE_CHARTS)]
-    return [rrb.Tabs(*(rrb.Vertical(*group, name=_group_name(group)) for group in groups))]
-
-
-def _group_name(views: list[Any]) -> str:
-    return ", ".join(str(view.name).split(" [")[0] for view in views)
+    return [
+        rrb.Tabs(
+            *(rrb.Vertical(*group, name=", ".join(str(view.name).split(" [")[0] for view in group)) for group in groups)
+        )
+    ]
 
 
 def styles(

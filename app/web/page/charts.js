@@ -19,7 +19,7 @@ const EQUAL_S = 1e-6; // s
 const LEGEND = {
   estimate: ["estimate", "Estimate of the filter"],
   band: ["± 2σ", "Estimate ± 2 standard deviations"],
-  "band-noise": ["of which noise", "Part of the band that is noise and the prior; the paler rest is the uncertainty of considered parameters"],
+  "band-noise": ["of which noise", "Part of the band that is noise and the prior; the paler rest is the uncertainty of considered parameters, and while the state is suspect, what its corrections were too large by"],
   integrity: [null, "Protection level: the largest error that one undetected fault can cause"],
   truth: [null, "Known true value, for comparison only"],
   reading: [null, "Measurement that the filter used"],

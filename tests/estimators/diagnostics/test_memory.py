@@ -83,35 +83,41 @@ def test_corrections_are_those_since_a_forecast(name):
     memory = folded(name, CELL, log).evidence[-fresh_memory(CELL).size :]
     first = size_of(memory_of, 2)
     for k, times in enumerate((((0, 32), (16, 48), (32, 64)), ((0, 64),))):
-        W = np.zeros(2)
+        W = excess = np.zeros(2)
         for time in times:
             z, rho, _ = by_forecasts(log, *time)
             # Half of log Λ of the variance 2.5 against 1, as the times overlap by half.
-            gained = np.where((rho > 0.2) & (rho < 0.9), 0.15 * np.clip(z, -6.0, 6.0) ** 2 - 0.25 * np.log(2.5), 0.0)
+            told = (rho > 0.2) & (rho < 0.9)
+            gained = np.where(told, 0.15 * np.clip(z, -6.0, 6.0) ** 2 - 0.25 * np.log(2.5), 0.0)
             W = np.maximum(W + gained, 0.0)
+            excess = np.where(told, 0.75 * excess + 0.25 * (np.minimum(z**2, 36.0) - 1.0), excess)
         level, own = plain(level_of)(0, 2), memory[first + k * size_of(level_of, 2) :]
-        np.testing.assert_allclose((view(level.W, own), view(level.rho, own)), (W, rho), rtol=1e-6, err_msg=f"{time}")
+        found = view(level.W, own), view(level.rho, own), view(level.excess, own)
+        np.testing.assert_allclose(found, (W, rho, excess), rtol=1e-6, err_msg=f"{time}")
 
 
 def told(scale, model=CELL, seed=0):
-    """Whether the charge is in its band, whether its state and the twin are suspect, by measurement; the fold."""
+    """Error of the charge in its σ, and whether its state and the twin are suspect, by measurement; the fold."""
     log, true = cell(scale, 4000, seed)
     fold = folded("kf", model, log, policy=QUIET)
     track = fold.track.select(slice(1, None, 2))
-    held = np.abs(track.mean[:, 0] - true[:, 0]) <= HALF_WIDTH * track.std[:, 0]
-    return held, state_health(track, 0) == SUSPECT, track.health == SUSPECT, fold
+    error = np.abs(track.mean[:, 0] - true[:, 0]) / track.std[:, 0]
+    return error, state_health(track, 0) == SUSPECT, track.health == SUSPECT, fold
 
 
 @pytest.mark.parametrize("seed", range(4))
 def test_a_model_that_is_right_is_never_suspect(seed):
-    held, own, twin, _ = told(1.0, seed=seed)
-    assert held.mean() > 0.85 and not own.any() and not twin.any()
+    error, own, twin, _ = told(1.0, seed=seed)
+    assert (error <= HALF_WIDTH).mean() > 0.85 and not own.any() and not twin.any()
 
 
 def test_a_steady_error_that_no_sensor_shows_is_told_of_the_state_that_it_moves():
-    held, own, twin, fold = told(0.9)
+    error, own, twin, fold = told(0.9)
+    factor = fold.track.factor[1::2]
     assert not fold.track.alarms.any(), "single innovations show nothing"
-    assert (~held & ~own).mean() <= 0.05 and own.mean() > 0.5
+    assert (~own & (error > HALF_WIDTH)).mean() <= 0.05 and own.mean() > 0.5
+    assert np.array_equal(factor[:, 0] > 1.0, own) and np.all(factor[:, 1] == 1.0)
+    assert (error <= HALF_WIDTH)[own].mean() < 0.9 and np.all((error <= HALF_WIDTH * factor[:, 0])[own])
     assert not (fold.track.flags & memory_flag(1)).any() and np.array_equal(own, twin)
     found = own_grades(CELL, fold.track, fold.u)
     assert found == {"charge": ("suspect", "corrected by more than its band allows, over its memory or from its prior")}

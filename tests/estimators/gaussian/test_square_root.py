@@ -3,6 +3,7 @@
 Tolerance between the forms, 1e-8 relative: 200 steps of a few hundred roundings, times the condition of P.
 """
 
+from dataclasses import replace
 from fractions import Fraction
 
 import numpy as np
@@ -189,20 +190,19 @@ def near_twins(x, u, p, out):
     out[1] = x[0] + x[1] + (1.0 + p[0]) * x[2]
 
 
+NEAR_TWINS = replace(
+    TWINS,
+    name="near_twins",
+    parameters=(Parameter("apart", "1", 0.0),),
+    sensors=(Sensor("both", rows("y1", "y2"), h=near_twins),),
+)
+
+
 @pytest.mark.parametrize("estimator", ["kf", "ekf", "iekf", "ukf", "ckf"])
 @pytest.mark.parametrize(("apart", "verdict"), [(4e-8, FAILED), (1e-6, USED)])
 def test_a_pivot_that_rounding_could_have_made_is_refused(estimator, apart, verdict):
     """The second pivot of H Hᵀ is 2/3 δ²: 1e-15, which rounding of 3 makes too, and so has a root; or 7e-13."""
-    model = StateSpaceModel(
-        name="near_twins",
-        title="two sensors that say nearly the same",
-        states=TWINS.states,
-        parameters=(Parameter("apart", "1", apart),),
-        noises=TWINS.noises,
-        sensors=(Sensor("both", rows("y1", "y2"), h=near_twins),),
-        f=unchanged,
-        linear=True,
-    )
+    model = replace(NEAR_TWINS, parameters=(Parameter("apart", "1", apart),))
     fold = folded(estimator, model, log_of(2, *AT_ONCE))
     assert fold.track.verdict[0] == verdict
 
@@ -211,16 +211,7 @@ def test_a_pivot_that_rounding_could_have_made_is_refused(estimator, apart, verd
 def test_square_roots_refuse_what_their_own_digits_cannot_tell(estimator):
     """The same row twice with noise of 1e-20: the second diagonal entry is rounding, 1e-16, beside 1.7."""
     twice = tuple(Row(name, "1", variance=1e-40) for name in ("y1", "y2"))
-    model = StateSpaceModel(
-        name="same",
-        title="one row twice",
-        states=TWINS.states,
-        parameters=(Parameter("apart", "1", 0.0),),
-        noises=TWINS.noises,
-        sensors=(Sensor("both", twice, h=near_twins),),
-        f=unchanged,
-        linear=True,
-    )
+    model = replace(NEAR_TWINS, sensors=(Sensor("both", twice, h=near_twins),))
     fold = folded(estimator, model, log_of(2, *AT_ONCE))
     assert fold.track.verdict[0] == FAILED
     np.testing.assert_array_equal(fold.track.mean[0], 0.0)

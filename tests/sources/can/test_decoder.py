@@ -56,7 +56,10 @@ def test_random_layouts_decode_as_cantools_does(tmp_path, seed):
         size = database.get_message_by_name(f"M{k}").length
         short = size if rng.random() < 0.8 else int(rng.integers(0, size + 1))
         frames.append((int(k), rng.bytes(short)))
-    messages = [frame(k + 16, data) if len(data) <= 8 else _fd(k + 16, data) for k, data in frames]
+    messages = [
+        can.Message(timestamp=1.0, arbitration_id=k + 16, is_extended_id=False, is_fd=len(data) > 8, data=data)
+        for k, data in frames
+    ]
     batch = decoder.decode(decoder.gather(messages, None))
     assert batch.channel.tolist() == [k for k, _ in frames]
     for (k, data), row in zip(frames, batch.value, strict=True):
@@ -64,10 +67,6 @@ def test_random_layouts_decode_as_cantools_does(tmp_path, seed):
         theirs = np.array([float(expected.get(name, np.nan)) for name in names[k]])
         theirs[~np.isfinite(theirs)] = np.nan
         np.testing.assert_array_equal(row[: theirs.size], theirs, err_msg=f"M{k} {data.hex()}")
-
-
-def _fd(identifier, data):
-    return can.Message(timestamp=1.0, arbitration_id=identifier, is_extended_id=False, is_fd=True, data=data)
 
 
 def test_extended_multiplexing_as_cantools_does(tmp_path):

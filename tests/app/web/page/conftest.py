@@ -4,7 +4,7 @@ from urllib.parse import urlsplit
 
 import pytest
 
-from tests.app.web.page.browsed import DRAWN, until
+from tests.app.web.page.browsed import DRAWN, running, until
 
 OWN_NAMES = ("127.0.0.1", "localhost")
 
@@ -44,6 +44,13 @@ def visit(browser):
 
     yield visit
     assert wrong == []
+
+
+@pytest.fixture(scope="module")
+def session():
+    """The session of a test's module, unless it has its own."""
+    with running("motor_winding") as session:
+        yield session
 
 
 @pytest.fixture

@@ -44,12 +44,6 @@ WIDER = """() => {
 
 
 @pytest.fixture(scope="module")
-def session():
-    with running("motor_winding") as session:
-        yield session
-
-
-@pytest.fixture(scope="module")
 def picture():
     with running("lorenz96", 4.0) as session:
         yield session

@@ -34,12 +34,6 @@ def cursor_is(page, seconds, play):
     wait_for(there)
 
 
-@pytest.fixture(scope="module")
-def session():
-    with running("motor_winding") as session:
-        yield session
-
-
 def test_page_and_rerun_show_one_time(page, session):
     end = float(pull_all(session.engine).events.t[-1]) * 1e-9
 

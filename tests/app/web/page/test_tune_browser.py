@@ -7,7 +7,6 @@ import pytest
 from app.twin.twin import load_twin
 from app.web.twin_json import model_json
 from config.loader import TWINS
-from tests.app.web.page.browsed import running
 
 pytestmark = pytest.mark.browser
 
@@ -37,12 +36,6 @@ BUILD = """async (model) => {
   }
   return [wrong, document.querySelectorAll("#tune .knob").length];
 }"""
-
-
-@pytest.fixture(scope="module")
-def session():
-    with running("motor_winding") as session:
-        yield session
 
 
 @pytest.fixture(scope="module")
