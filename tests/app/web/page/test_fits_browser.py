@@ -92,9 +92,8 @@ def test_the_nis_is_seen_on_a_low_window_and_the_choice_of_the_error_is_whole(vi
         assert box["y"] >= panel["y"] and box["y"] + box["height"] <= panel["y"] + panel["height"] + 1
         page.get_by_role("tab", name="Runs").click()
         select = page.get_by_label("State or sensor of the error")
-        select.wait_for()
-        # As wide as its longest text.
-        assert select.evaluate("(node) => node.scrollWidth <= node.clientWidth && node.clientWidth > 100")
+        # As wide as its longest text. Scores that arrive replace the panel, and with it the node that is asked.
+        wait_for(lambda: select.evaluate("(node) => node.scrollWidth <= node.clientWidth && node.clientWidth > 100"))
 
 
 def test_a_narrow_scale_has_two_ends(visit, picture):
