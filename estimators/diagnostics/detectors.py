@@ -272,7 +272,7 @@ DETECTORS = (
     ),
     Detector(
         "impossible",
-        "{0.name} is {0.size:.4g}{0.spaced_unit}, and its band lies beyond {0.limits}, {0.since}",
+        "{0.name} is wrong {0.since}, as it reached {0.size:.4g}{0.spaced_unit} with a band beyond {0.limits}",
         "a sensor has an offset or a wrong scale, or the model is wrong: `nisus check` compares them",
         statistic="band of a state beside its physical limits",
         effect="the value",
@@ -381,14 +381,15 @@ def is_outside(item: State | Input, value: float) -> bool:
     return not low <= value <= high
 
 
-SENSOR_FLAGS = 42  # Sensors with a bit of their own in `Track.flags`, the lowest; the others share the last
+SENSOR_FLAGS = 26  # Sensors with a bit of their own in `Track.flags`, the lowest; the others share the last
 SENSOR_MASK = (1 << SENSOR_FLAGS) - 1
 MEMORY_AT, MEMORY_FLAGS = SENSOR_FLAGS, 16  # First bit of the shown states, and how many of them have one
+IMPOSSIBLE_AT = MEMORY_AT + MEMORY_FLAGS  # First of their bits while an impossible estimate still matters
 
 
-def memory_flag(column: int) -> int:
+def memory_flag(column: int, at: int = MEMORY_AT) -> int:
     """Return the bit of `Track.flags` of a shown state whose corrections are too large (memory.py), or 0."""
-    return 1 << MEMORY_AT + column if column < MEMORY_FLAGS else 0
+    return 1 << at + column if column < MEMORY_FLAGS else 0
 
 
 # What follows is compiled into the kernels as constants.

@@ -26,10 +26,11 @@ from ..compiled.context import circular_states, estimated, shown_states
 from ..compiled.jacobians import scratch_size, state_jacobian
 from ..estimator import Estimator
 from ..model.state_space import StateSpaceModel
-from ..numerics.jit import inlined, part, plain
+from ..numerics.jit import floats, inlined, part, plain
 from ..numerics.linalg import congruence, copy, copy_vector, multiply, wrap
 from ..numerics.workspace import declare_layout, size_of, view
-from .detectors import MEMORY_AT, MEMORY_FLAGS, memory_flag
+from .detectors import IMPOSSIBLE, IMPOSSIBLE_AT, MEMORY_AT, MEMORY_FLAGS, memory_flag
+from .references import HALF_WIDTH
 
 FIRST, LEVELS = 16, 16  # Measurements of a time of the first level, and the levels: half a million measurements
 MAX_STATES = 32  # States of a model whose memory is followed
@@ -51,8 +52,10 @@ Memory, memory_of = declare_layout(
     scratch_size,
     count="2",  # measurements of the present time; bits of the states in alarm
     first="3",  # bits of sensors heard; e of a contradicted prior, or 0; bits of the states that are still its own
-    B="n, n",  # Φ P₀ Φᵀ of a contradicted prior
-    G="n, n",  # variance that measurements have taken from a forecast since
+    P0="n, n",  # a contradicted prior
+    prior="Time(at, n)",  # since then
+    impossible="1",  # bits of the states that are it, or would be it but for the model's own motion
+    possible="Time(at, n)",  # since an estimate was impossible; d: less the forecast from its limit
     now="Time(at, n)",
     joined="Time(at, n)",
     x="n",
@@ -131,6 +134,7 @@ def forget_memory(at, n):
     own = memory_of(at, n)
     own.count[0] = own.count[1] = 0.0
     own.first[:] = 0.0
+    own.impossible[0] = 0.0
     _clear(own.now)
     for k in range(LEVELS):
         level = level_of(own.end + 8 * k * level_words(n), n)
@@ -147,8 +151,9 @@ def carry_memory(context, at, x, u, dt):
     state_jacobian(context, x, u, dt, own.F, own.jacobian)
     _carry(own.F, estimated(context), own.now, own.products)
     if own.first[1] > 0.0:
-        congruence(own.F, estimated(context), own.B, own.products)
-        congruence(own.F, estimated(context), own.G, own.products)
+        _carry(own.F, estimated(context), own.prior, own.products)
+    if own.impossible[0] > 0.0:
+        _carry(own.F, estimated(context), own.possible, own.products)
 
 
 @inlined
@@ -178,25 +183,37 @@ def after_update(context, at, state, sensor, innovation, std):
     """Add a correction, and judge the times that end with it; ν and √diag S (ny,) tell whether the prior was wrong."""
     n = context.nx
     own, circular = memory_of(at, n), circular_states(context)
-    now = own.now
-    _hear(own, 1 << min(sensor, MAX_SENSORS), estimated(context), innovation, std)
+    _hear(own, 1 << min(sensor, MAX_SENSORS), innovation, std)
     copy(own.P, own.F)
     _spread(context.memory, n, state, own.P)
     for i in range(n):
         moved = state[i] - own.x[i]
-        now.d[i] += wrap(moved) if circular[i] != 0 else moved
+        own.x[i] = wrap(moved) if circular[i] != 0 else moved
         for j in range(n):
-            now.D[i, j] += own.F[i, j] - own.P[i, j]
-            own.G[i, j] += own.F[i, j] - own.P[i, j]
+            own.F[i, j] -= own.P[i, j]
+    _correct(own.now, own.x, own.F)
     if own.first[1] > 0.0:
+        _correct(own.prior, own.x, own.F)
         _weigh_prior(context, own)
+    if own.impossible[0] > 0.0:
+        _correct(own.possible, own.x, own.F)
+    _weigh_limits(context, own, state)
     own.count[0] += 1.0
     if own.count[0] >= FIRST:
         _end_time(context, at, own)
 
 
 @inlined
-def _hear(own, bit, estimated, innovation, std):
+def _correct(time, moved, taken):
+    """Add a correction, and the variance that it has taken."""
+    for i in range(moved.size):
+        time.d[i] += moved[i]
+        for j in range(moved.size):
+            time.D[i, j] += taken[i, j]
+
+
+@inlined
+def _hear(own, bit, innovation, std):
     """Note whether the first measurement of a sensor, used or refused, contradicts the prior of what is estimated."""
     if int(own.first[0]) & bit == 0:
         own.first[0] += bit
@@ -204,10 +221,8 @@ def _hear(own, bit, estimated, innovation, std):
             e = abs(innovation[k]) / std[k]
             if e > FIRST_SIGMA:
                 own.first[1] = max(own.first[1], min(e, MAX_Z))
-                copy(own.P, own.B)
-                own.G[:] = 0.0
-                own.B[estimated:] = 0.0
-                own.B[:, estimated:] = 0.0
+                copy(own.P, own.P0)
+                _clear(own.prior)
 
 
 @inlined
@@ -217,15 +232,43 @@ def _weigh_prior(context, own):
     The prior gives B = Φ P₀ Φᵀ of the variance P + G of a forecast from it, and measurements have left the share
     ρ = P / (P + G) of its error: e ρ √B > √P.
     """
-    bits, shown, e = 0, shown_states(context), own.first[1]
+    bits, shown, e, Phi = 0, shown_states(context), own.first[1], own.prior.Phi
     for s in range(min(shown.size, MEMORY_FLAGS)):
         j = shown[s]
-        forecast = own.P[j, j] + own.G[j, j]
-        if context.graded >> s & 1 != 0 and e * e * own.B[j, j] * own.P[j, j] > forecast * forecast:
+        B = 0.0
+        for k in range(estimated(context)):
+            for m in range(estimated(context)):
+                B += Phi[j, k] * own.P0[k, m] * Phi[j, m]
+        forecast = own.P[j, j] + own.prior.D[j, j]
+        if context.graded >> s & 1 != 0 and e * e * B * own.P[j, j] > forecast * forecast:
             bits |= 1 << s
     own.first[2] = bits
     if bits == 0:
         own.first[1] = 0.0
+
+
+@inlined
+def _weigh_limits(context, own, state):
+    """Find the states that are beyond their limits, or inside because the model moves them, not the measurements.
+
+    If the true state was at the limit when the estimate was impossible, it has moved since as the model predicts. d is
+    the estimate less that forecast, and P + D the variance of the forecast: |d| > 1.96 √(P + D).
+    """
+    shown, bits = shown_states(context), int(own.impossible[0])
+    ranges, found = floats(context.ranges, 6 * shown.size), 0
+    for s in range(min(shown.size, MEMORY_FLAGS)):
+        j = shown[s]
+        low, high = ranges[6 * s + 4], ranges[6 * s + 5]
+        beyond = max(state[j] - high, 0.0) + min(state[j] - low, 0.0)
+        left = own.possible.d[j] if bits >> s & 1 != 0 else 0.0
+        if abs(beyond) > HALF_WIDTH * np.sqrt(own.P[j, j]) and abs(beyond) > abs(left):
+            if bits | found == 0:
+                own.possible.d[:] = 0.0
+            left = own.possible.d[j] = beyond
+            own.possible.D[:] = 0.0
+        if abs(left) > HALF_WIDTH * np.sqrt(own.P[j, j] + own.possible.D[j, j]):
+            found |= 1 << s
+    own.impossible[0] = found
 
 
 @inlined
@@ -236,7 +279,8 @@ def memory_flags(context, at, factor):
     for s in range(min(shown.size, MEMORY_FLAGS)):
         if bits >> s & 1 != 0:
             factor[s] = np.sqrt(1.0 + _judged(own, context.nx, shown[s])[1])
-    return (bits | int(own.first[2])) << MEMORY_AT
+    flags, impossible = (bits | int(own.first[2])) << MEMORY_AT, int(own.impossible[0])
+    return flags | impossible << IMPOSSIBLE_AT | IMPOSSIBLE if impossible != 0 else flags
 
 
 @inlined

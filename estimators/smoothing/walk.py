@@ -183,5 +183,5 @@ class Smoothed(NamedTuple):
         return Smoothed(*(column[part] for column in self))
 
     def instead_of(self, track: Track) -> Track:
-        """Return the fold's track with these moments in place of its own."""
-        return track._replace(mean=self.mean, std=self.std, cross=self.cross)
+        """Return the fold's track with these moments in place of its own, and of their bands."""
+        return track._replace(mean=self.mean, std=self.std, cross=self.cross, factor=np.ones_like(track.factor))

@@ -10,6 +10,7 @@ from ...log import INPUT
 from ...model.state_space import Input, State
 from ...track import DIVERGED, GATED, HEALTH_NAMES, SCREENED, STALE, WAITING
 from ..detectors import (
+    IMPOSSIBLE_AT,
     IMPOVERISHED,
     REFUSED,
     SENSOR_FLAGS,
@@ -92,7 +93,9 @@ def left_ranges(judged: JudgedRows) -> Iterator[FoundEpisode]:
         yield from _outside(state, mean, t)
         if state.limits is not None:
             low, high = state.limits
-            yield from _beyond(state, "impossible", (mean + half < low) | (mean - half > high), mean, t, state.limits)
+            proven = track.flags & memory_flag(column, IMPOSSIBLE_AT) != 0
+            rows = proven | (mean + half < low) | (mean - half > high)
+            yield from _beyond(state, "impossible", rows, mean, t, state.limits)
         if state.watched:
             yield from _beyond(state, "corrected", track.flags & memory_flag(column) != 0, mean, t)
     rows = np.flatnonzero(events.kind == INPUT)

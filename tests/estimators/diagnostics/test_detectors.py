@@ -10,7 +10,16 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from estimators.diagnostics.detector_state import no_baseline
-from estimators.diagnostics.detectors import ADVISORY_ALARM, ALARM_NAMES, FAR_OUTSIDE, IMPOSSIBLE, OUTSIDE, memory_flag
+from estimators.diagnostics.detectors import (
+    ADVISORY_ALARM,
+    ALARM_NAMES,
+    FAR_OUTSIDE,
+    IMPOSSIBLE,
+    IMPOSSIBLE_AT,
+    MEMORY_AT,
+    OUTSIDE,
+    memory_flag,
+)
 from estimators.diagnostics.health import HealthPolicy
 from estimators.fold import Fold, fold
 from estimators.log import INPUT, READING, RESET, TICK, TRUTH, Events, Log
@@ -74,7 +83,7 @@ POLICY = HealthPolicy(
     window=20, degraded_after=3.0, stale_after=12.0, diverged_nis=30.0, diverged_gated=0.9, false_alarm_every=600.0
 )
 """Of the window little is asked, so that what the tests say is seen."""
-CORRECTED = memory_flag(0) | memory_flag(1)  # See test_memory.py
+CORRECTED = sum(memory_flag(k, at) for k in (0, 1) for at in (MEMORY_AT, IMPOSSIBLE_AT))  # See test_memory.py
 
 
 # The oracle
@@ -366,7 +375,8 @@ def by_definition(events, track, gate, baseline, expected):
         # Of a range of ±1 5 % more counts, and half of its width is far.
         beyond = max(abs(track.mean[i, 0]) / 3.0, abs(feed))
         flags |= (OUTSIDE if beyond > 1.1 else 0) | (FAR_OUTSIDE if beyond > 2.0 else 0)
-        if abs(track.mean[i, 0]) - 1.959963984540054 * track.std[i, 0] > 3.5:
+        beyond = abs(track.mean[i, 0]) - 1.959963984540054 * track.std[i, 0] > 3.5
+        if beyond or flags & memory_flag(0, IMPOSSIBLE_AT):
             flags |= IMPOSSIBLE
         said = set().union(*(row.said for row in rows))
         if not heard:

@@ -5,7 +5,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from estimators.diagnostics.detectors import memory_flag
+from estimators.diagnostics.detectors import IMPOSSIBLE_AT, memory_flag
 from estimators.diagnostics.health import HealthPolicy
 from estimators.diagnostics.memory import fresh_memory, level_of, memory_of
 from estimators.diagnostics.references import HALF_WIDTH, own_grades, state_health
@@ -15,6 +15,7 @@ from estimators.log import INPUT, READING, RESET, Log
 from estimators.model.state_space import Input, Noise, Row, Sensor, State, StateSpaceModel
 from estimators.numerics.jit import plain
 from estimators.numerics.workspace import size_of, view
+from estimators.smoothing.smooth import smooth
 from estimators.track import SUSPECT
 from estimators.tuning import Tuning
 from tests.support import folded, log_of
@@ -118,6 +119,7 @@ def test_a_steady_error_that_no_sensor_shows_is_told_of_the_state_that_it_moves(
     assert (~own & (error > HALF_WIDTH)).mean() <= 0.05 and own.mean() > 0.5
     assert np.array_equal(factor[:, 0] > 1.0, own) and np.all(factor[:, 1] == 1.0)
     assert (error <= HALF_WIDTH)[own].mean() < 0.9 and np.all((error <= HALF_WIDTH * factor[:, 0])[own])
+    assert np.all(smooth(fold).instead_of(fold.track).factor == 1.0), "they are of the filter's corrections"
     assert not (fold.track.flags & memory_flag(1)).any() and np.array_equal(own, twin)
     found = own_grades(CELL, fold.track, fold.u)
     assert found == {"charge": ("suspect", "corrected by more than its band allows, over its memory or from its prior")}
@@ -137,6 +139,35 @@ def test_a_prior_that_the_first_measurement_contradicts_is_told_of_what_it_still
         rho, P = 1.0, P / rho
     error = 6.0 * rho * np.column_stack((np.full(399, 0.05), 0.1 * 0.95 ** np.arange(1, 400)))
     np.testing.assert_array_equal(own, error > np.sqrt(P))
+
+
+@pytest.mark.parametrize(("offset", "until"), [(0.3, 600), (0.9, 3)])
+def test_an_impossible_estimate_is_told_until_measurements_have_corrected_it(offset, until):
+    """While it is more than 1.96 σ of a forecast from its limit beyond that forecast, though the charge has sunk."""
+    limited = replace(CELL, states=(replace(CELL.states[0], mean=0.95, limits=(0.0, 1.0)), CELL.states[1]))
+    rng, rows, n = np.random.default_rng(3), [], 600
+    for i in range(n):
+        y = 0.95 - 1e-3 * i + rng.normal(0.0, 0.02) + (offset if i < until else 0.0)
+        rows += [(i, INPUT, -1.0), (i, READING, y - 0.05 * (1.0 - 0.95**i))]
+    log = log_of(CELL.width, *rows)
+    fold = folded("kf", limited, log, policy=QUIET)
+    track, y = fold.track.select(slice(1, None, 2)), log.value[1::2, 0]
+    F, Q, H = np.diag([1.0, 0.95]), np.diag([1e-8, 1e-4]), np.array([1.0, 0.05])
+    x, P, start, told = np.array([0.95, 0.0]), np.diag([0.05**2, 0.1**2]), None, []
+    for i in range(n):
+        if i:
+            x, P = F @ x - [1e-3, 0.05], F @ P @ F.T + Q
+            start = start and (F @ start[0] - [1e-3, 0.05], F @ start[1] @ F.T + Q)
+        K = P @ H / (H @ P @ H + VOLTAGE)
+        x, P = x + K * (y[i] - H @ x), P - np.outer(K, H @ P)
+        if x[0] - 1.0 > max(HALF_WIDTH * P[0, 0] ** 0.5, x[0] - start[0][0] if start else 0.0):
+            start = np.array([1.0, x[1]]), P
+        if start and x[0] - start[0][0] <= HALF_WIDTH * start[1][0, 0] ** 0.5:
+            start = None
+        told.append(start is not None)
+    found = track.flags & memory_flag(0, IMPOSSIBLE_AT) != 0
+    np.testing.assert_array_equal(found, told)
+    assert found[0] and found[-1] == (until == n) and track.mean[-1, 0] < 1.0
 
 
 def test_a_reset_begins_again():

@@ -238,7 +238,8 @@ def test_an_input_outside_its_range():
     each, track = found["level", "impossible"], fold.track
     beyond = fold.log.t[: fold.n][track.mean[:, 0] + 1.959963984540054 * track.std[:, 0] < -100.0] * 1e-9
     assert (each.start, each.size, each.grade) == (beyond[0], track.mean[:, 0].min(), "suspect")
-    assert each.text.startswith(f"level is {each.size:.4g} m, and its band lies beyond -100 to 100, since ")
+    said = f", as it reached {each.size:.4g} m with a band beyond -100 to 100"
+    assert each.text.startswith(f"level is wrong since {each.start:.1f} s{said}")
 
 
 def test_a_gate_that_refuses_all_is_divergence():
