@@ -91,8 +91,9 @@ def share_interval(inside: np.ndarray, like: np.ndarray) -> Interval:
     centre = (share + square / (2.0 * independent)) / (1.0 + square / independent)
     half = np.sqrt(square * (share * (1.0 - share) / independent + square / (4.0 * independent**2)))
     half /= 1.0 + square / independent
-    # Rounding must not put the share outside.
-    return Interval(share, float(min(share, centre - half)), float(max(share, centre + half)))
+    # Rounding must put neither the share outside, nor an end beyond 0 and 1.
+    low, high = np.clip((centre - half, centre + half), 0.0, 1.0)
+    return Interval(share, float(min(share, low)), float(max(share, high)))
 
 
 def correlation_interval(x: np.ndarray) -> Interval:

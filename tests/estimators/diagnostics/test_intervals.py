@@ -98,6 +98,7 @@ def test_what_never_changes_is_worth_as_little_as_the_values_it_is_told_of():
     assert share_interval(always, slow).low < 0.8 < 0.99 < share_interval(always, white).low
     # So is one whose sign alternates about it.
     assert share_interval(always, slow * np.tile([1.0, -1.0], STEPS // 2)).low < 0.8
+    assert all(0.0 <= share_interval(~always[:n], like[:n]).low for n in range(8, 400) for like in (slow, white))
 
 
 def test_few_values_have_no_interval():
