@@ -206,10 +206,10 @@ def _override(data: dict[str, Any], places: ValuePlaces, dotted_key: str, text: 
             here[key[-1]] = value
         elif isinstance(here, dict) and here.get(part) is None:
             here[part] = {}
-            places.options[tuple(key)] = option
+            places.give(tuple(key), option)
         elif parts[0] in ("parameters", "sensors", "inputs") and parts[k + 1] in ParameterSection.model_fields:
             # A number is the short form of a parameter, an offset or a scale.
             if isinstance(here, dict) and isinstance(here[part], int | float):
                 here[part] = {"value": here[part]}
         here = here[key[-1]]
-    places.options[tuple(key)] = option
+    places.give(tuple(key), option)

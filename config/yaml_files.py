@@ -82,6 +82,13 @@ class ValuePlaces:
                 return f"{self.file}:{self.lines[key[:end]]}"
         return f"{self.file}:1"
 
+    def give(self, key: Key, option: str) -> None:
+        """Note the option that gave the value at `key` and everything in it, in place of the file."""
+        for known in (self.lines, self.options):
+            for inner in [inner for inner in known if inner[: len(key)] == key]:
+                del known[inner]
+        self.options[key] = option
+
 
 def parse(text: str, file: str) -> tuple[Any, ValuePlaces]:
     """Parse YAML; return the data, with every key as text, and the place of every value. Messages name `file`.
