@@ -148,12 +148,8 @@ def moment_of(option: str, text: str, events: Events) -> int:
 def options_of(command: type) -> dict[str, Any]:
     """Return the types of a command's options, by field; positional arguments are left out."""
     hints = get_type_hints(command, include_extras=True)
-    return {field.name: hints[field.name] for field in dataclasses.fields(command) if not is_positional(hints, field)}
-
-
-def is_positional(hints: dict[str, Any], field: dataclasses.Field[Any]) -> bool:
-    """Return whether a field of a command is a positional argument."""
-    return tyro.conf.Positional in getattr(hints[field.name], "__metadata__", ())
+    hints = {field.name: hints[field.name] for field in dataclasses.fields(command)}
+    return {name: kind for name, kind in hints.items() if tyro.conf.Positional not in getattr(kind, "__metadata__", ())}
 
 
 def check_options(name: str, command: type, words: Sequence[str]) -> None:

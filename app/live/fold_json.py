@@ -60,12 +60,9 @@ def base_to_json(base: Base | None) -> str:
     moments = {"mean": base.mean.tolist(), "cov": base.cov.tolist(), "clock": base.clock, "u": base.u.tolist()}
     moments |= {"first": base.first, "version": base.version}
     arrays = {"state": base.state, "edge": base.edge, "evidence": base.evidence, "doubt": base.doubt}
-    held = {key: _to_base64(array) for key, array in arrays.items() if array is not None}
+    known = {key: np.ascontiguousarray(array, "<f8") for key, array in arrays.items() if array is not None}
+    held = {key: base64.b64encode(array.tobytes()).decode() for key, array in known.items()}
     return json.dumps({**moments, "estimator": base.estimator, **held})
-
-
-def _to_base64(numbers: np.ndarray) -> str:
-    return base64.b64encode(np.ascontiguousarray(numbers, "<f8").tobytes()).decode()
 
 
 def _from_base64(text: str | None) -> np.ndarray | None:

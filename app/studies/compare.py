@@ -17,6 +17,7 @@ from estimators.log import MARK, Events, Log
 from estimators.registry import ESTIMATORS, find_entry, find_estimator, unfit
 from estimators.track import DIVERGED
 
+from ..present.series.columns import units_by_name
 from ..twin.twin import Twin, load_twin, with_held
 from .processes import results
 from .scores import FilterScore, Spread, pictures_of
@@ -142,13 +143,11 @@ def outcome_of(fold: Fold, events: Events, seconds: float, scored: tuple[int, in
     pictures = [one for one in pictures_of(fold) if part.start < one.before <= part.stop]
     model, track, events = fold.model, fold.track.select(part), events.select(part)
     result = score(track, events, model, pictures, gate=fold.tuning.gate, baseline=fold.tuning.baseline)
-    fits, units = result.states, {state.name: state.unit for state in model.shown_states}
+    fits, units = result.states, units_by_name(model)
     if result.field is not None and model.grid is not None:
         fits, units = {model.grid.name: result.field}, {model.grid.name: model.grid.unit}
     if not fits:
         fits = result.held_out
-        row_units = [row.unit for sensor in model.sensors for row in sensor.rows]
-        units = dict(zip(model.row_names, row_units, strict=True))
     groups: dict[str, list[Fit]] = {}
     for name, fit in fits.items():
         groups.setdefault(units[name], []).append(fit)

@@ -415,7 +415,18 @@ def keep_last(twin: Path, found: Sequence[GuardVerdict]) -> None:
     """
     path = folders(twin)[0] / VERDICT_FILE
     saved = {each["recording"]: each for each in last(twin)}
-    saved |= {each.name: _verdict_json(each) for each in found}
+    for each in found:
+        saved[each.name] = {
+            "recording": each.name,
+            "at": now(),
+            "version": each.version,
+            "figures": len(each.compared),
+            "worse": [figure.in_words() for figure in each.compared if figure.worse],
+            "better": [
+                f"{one.figure} was {one.before:.6g} and is {one.now:.6g}" for one in each.compared if one.better
+            ],
+            "failure": each.failure,
+        }
     text = json.dumps({"recordings": list(saved.values())}, indent=1)
     other = path.with_name(f".{VERDICT_FILE}.{os.getpid()}")
     with contextlib.suppress(OSError):
@@ -435,15 +446,3 @@ def last(twin: Path) -> list[dict[str, Any]]:
         return sorted(found, key=lambda each: (each["at"], each["recording"]), reverse=True)
     except (OSError, ValueError, KeyError, TypeError):
         return []
-
-
-def _verdict_json(each: GuardVerdict) -> dict[str, Any]:
-    return {
-        "recording": each.name,
-        "at": now(),
-        "version": each.version,
-        "figures": len(each.compared),
-        "worse": [figure.in_words() for figure in each.compared if figure.worse],
-        "better": [f"{one.figure} was {one.before:.6g} and is {one.now:.6g}" for one in each.compared if one.better],
-        "failure": each.failure,
-    }

@@ -72,9 +72,9 @@ def columns_of(model: StateSpaceModel) -> dict[str, Column]:
             Column(f"refused:{name}", DOTS, partial(_reading, sensor, row, (GATED, FAILED))),
             Column(f"held:{name}", DOTS, partial(_reading, sensor, row, (HELD_OUT,))),
             Column(f"screened:{name}", DOTS, partial(_screened, sensor, row)),
-            Column(f"innovation:{name}", DOTS, partial(_innovation, sensor, row)),
-            Column(f"innovation_upper:{name}", UPPER, partial(_bound, sensor, row, 2.0)),
-            Column(f"innovation_lower:{name}", LOWER, partial(_bound, sensor, row, -2.0)),
+            Column(f"innovation:{name}", DOTS, partial(_of_row, sensor, row, "innovation", 1.0)),
+            Column(f"innovation_upper:{name}", UPPER, partial(_of_row, sensor, row, "innovation_std", 2.0)),
+            Column(f"innovation_lower:{name}", LOWER, partial(_of_row, sensor, row, "innovation_std", -2.0)),
         ]
     found += [Column(f"input:{item.name}", LINE, partial(_input, k)) for k, item in enumerate(model.inputs)]
     found += [
@@ -147,12 +147,9 @@ def _screened(sensor: int, row: int, rows: Rows) -> np.ndarray:
     return np.where(rows.of_sensor(sensor) & (rows.track.screened[:, row] != 0), rows.events.value[:, row], np.nan)
 
 
-def _innovation(sensor: int, row: int, rows: Rows) -> np.ndarray:
-    return np.where(rows.of_sensor(sensor), rows.track.innovation[:, row], np.nan)
-
-
-def _bound(sensor: int, row: int, spread: float, rows: Rows) -> np.ndarray:
-    return np.where(rows.of_sensor(sensor), spread * rows.track.innovation_std[:, row], np.nan)
+def _of_row(sensor: int, row: int, name: str, factor: float, rows: Rows) -> np.ndarray:
+    """Return a column of the track, of the measurements of a row, times a factor."""
+    return np.where(rows.of_sensor(sensor), factor * getattr(rows.track, name)[:, row], np.nan)
 
 
 def _input(k: int, rows: Rows) -> np.ndarray:

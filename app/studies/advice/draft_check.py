@@ -52,11 +52,6 @@ class Split(NamedTuple):
         """Whether there are more than two parts."""
         return len(self.edges) > 1
 
-    @property
-    def last_fitted(self) -> int:
-        """End of the last part that is fitted, ns."""
-        return self.edges[-1]
-
     def fitted(self, t: np.ndarray) -> np.ndarray:
         """Return the mask of the times (n,), ns, that are in a fitted part."""
         mask: np.ndarray = np.searchsorted(self.edges, t, side="right") % 2 == 0
@@ -135,7 +130,7 @@ class DraftFold:
         larger = coloured(model, noises, errors)
         used = np.array([name not in drafted.held_out for name in larger.sensor_names])
         self._tuning = replace(with_options(Tuning.of(larger), drafted.options), used=used)
-        end = split.last_fitted if fitted_only else np.iinfo(np.int64).max
+        end = split.edges[-1] if fitted_only else np.iinfo(np.int64).max
         self._log = log_of(larger, self._sensors, drafted.inputs, zero, end, zero)
         self._fold = self._folded(self._tuning)
 

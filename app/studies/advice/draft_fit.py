@@ -259,11 +259,12 @@ def _fit_split(drafted: DraftPlan, split: Split, progress: FitProgress) -> Gener
     with tempfile.TemporaryDirectory() as name:
         files = ModelFiles(Path(name))
         choices: list[list[FittedStructure | None]] = []
+        early: list[int] = []  # readings in the fitted parts
         for k, item in enumerate(drafted.states):
             yield FitStep(f"fitting {item.name}, {k + 1} of {len(drafted.states)} states")
             inputs = [each for each in drafted.inputs if each[0] in item.inputs]
-            early = sum(int(split.fitted(reads.signal.series.t).sum()) for reads in item.sensors)
-            able = early >= MIN_VALUES and not progress.stop
+            early.append(sum(int(split.fitted(reads.signal.series.t).sum()) for reads in item.sensors))
+            able = early[-1] >= MIN_VALUES and not progress.stop
             choices.append(fitted(item, inputs, split, span, files, progress) if able else [])
         tried: list[DraftFold] = []
         for k, one in enumerate(_combined(drafted, choices)):
@@ -285,18 +286,13 @@ def _fit_split(drafted: DraftPlan, split: Split, progress: FitProgress) -> Gener
         yield FitStep("checking on the parts left out" if split.alternate else "checking on the second half")
         with suppress(NisusError):
             fitted_plan = replace(fitted_plan, check=DraftFold(fitted_plan, best.model, split).check(span))
-            if fitted_plan.check is not None and _early(drafted.states, split) < MIN_FITTED and not progress.stop:
+            if fitted_plan.check is not None and min(early) < MIN_FITTED and not progress.stop:
                 yield FitStep("fitting all of the short recording")
                 whole = Split((int(t.max()) + 1,))
                 again = [_again(item, fitted_plan, whole, span, files, progress) for item in fitted_plan.states]
                 check = fitted_plan.check._replace(refitted=True)
                 fitted_plan = replace(fitted_plan, states=tuple(again), check=check)
         return fitted_plan
-
-
-def _early(states: Iterable[Moves], split: Split) -> int:
-    """Return the fewest readings of a state in the fitted parts."""
-    return min(sum(int(split.fitted(one.signal.series.t).sum()) for one in item.sensors) for item in states)
 
 
 def _again(

@@ -70,7 +70,7 @@ class Term:
         if method != "__call__":
             return NotImplemented
         if any(isinstance(item, np.ndarray) and item.ndim for item in inputs):
-            return ufunc(*(as_objects(item) for item in inputs))
+            return ufunc(*(item.astype(object) if isinstance(item, np.ndarray) else item for item in inputs))
         return getattr(self, ufunc.__name__)() if ufunc.nin == 1 else self._with(_named(ufunc.__name__), *inputs)
 
     def __getattr__(self, name: str) -> Callable[..., Term]:
@@ -150,11 +150,6 @@ _operators()
 def _named(name: str) -> str:
     """Return the name in C of an operation by NumPy's name."""
     return NUMPY.get(name, name)
-
-
-def as_objects(item: Any) -> Any:
-    """Return an array as one of objects."""
-    return item.astype(object) if isinstance(item, np.ndarray) else item
 
 
 class UnmergedError(Exception):

@@ -56,13 +56,9 @@ def matrix(model: StateSpaceModel, tuning: Tuning, events: Events, *, asset: boo
     sensors = [sensor for s, sensor in enumerate(model.sensors) if s in spoken]
     faults = [*_of_sensors(model, tuning, sensors), *_of_inputs(model, events), *_of_time(sensors)]
     found = [*_of_noises(model), *_of_priors(model), *faults, *_of_model(model, tuning, asset)]
-    lasting = [_lasting(item) for item in faults if item.nudges]
+    # The faults of the source, over the whole log.
+    lasting = [replace(one, name=f"{one.name} from the start", from_start=True) for one in faults if one.nudges]
     return [*found, *lasting, *_pairs([*found, *lasting])]
-
-
-def _lasting(mistake: Mistake) -> Mistake:
-    """Return a fault of the source over the whole log."""
-    return replace(mistake, name=f"{mistake.name} from the start", from_start=True)
 
 
 def _pairs(mistakes: Sequence[Mistake]) -> Iterator[Mistake]:

@@ -138,7 +138,13 @@ class RerunFeed:
         # The engine gives a notice once, and the viewer loses it with the recording that it closes. Notices from before
         # the source restarted have later times than its rows, so they are left out.
         here = self._engine.notices.passage
-        rows.notices([_labelled(line, pull.revision) for line in self._notices if line.passage == here])
+        notices = (line for line in self._notices if line.passage == here)
+        rows.notices(
+            [
+                line if line.revision == pull.revision else replace(line, text=f"revision {line.revision}: {line.text}")
+                for line in notices
+            ]
+        )
         if cut:
             self._later = lambda: draw(slice(0, cut), slice(known, grey_cut), past=True)
         return [announcement, *self._read()]
@@ -153,8 +159,3 @@ class RerunFeed:
         )
         data = self._bytes.read()
         return [data] if data else []
-
-
-def _labelled(line: Notice, revision: int) -> Notice:
-    """Return a notice for the table of a revision; one of another revision is labelled."""
-    return line if line.revision == revision else replace(line, text=f"revision {line.revision}: {line.text}")
