@@ -12,6 +12,7 @@ import numpy as np
 
 from config.source_schema import CanLogSection, CanSection, MergedSection
 from estimators.diagnostics.calibration import BANDS, Calibration
+from estimators.diagnostics.detectors import is_outside
 from estimators.diagnostics.episodes import Episode, episode_json, episodes
 from estimators.diagnostics.repeats import Finding
 from estimators.diagnostics.score import health_of
@@ -322,8 +323,13 @@ def topics(checked: Checked, checklist: Sequence[ChecklistLine]) -> list[Topic]:
     if len(checked.episodes) > MAX_ROWS:
         health.append(f"... and {len(checked.episodes) - MAX_ROWS} more episodes.")
     health += calibration_lines(checked.calibration, twin.model)[: 2 * MAX_ROWS]
+    asked = [
+        f"valid.{state.name} leaves out the prior's mean, {state.mean:g}{spaced(state.unit)}: is it in that unit?"
+        for state in twin.model.shown_states
+        if state.name in twin.config.valid and state.fitted and is_outside(state, state.mean)
+    ]
     return [
-        Topic(f"{twin.name}: {twin.title}", (head,)),
+        Topic(f"{twin.name}: {twin.title}", (head, *asked)),
         Topic("Checklist", (), columns, lines, marks=tuple(line.mark for line in checklist)),
         *_fault_topics(checked),
         *_held_out_topics(checked),

@@ -14,7 +14,6 @@ from estimators.diagnostics.detectors import ALARM_NAMES, CAUSES
 from estimators.diagnostics.episodes.baseline import Normal
 from estimators.errors import ConfigError, nearest
 from estimators.fit.entries import check_key
-from estimators.model.parts import CellNames
 from estimators.model.state_space import StateSpaceModel
 from estimators.tuning import Tuning
 
@@ -53,7 +52,7 @@ def check_scene(loaded: Loaded, model: StateSpaceModel) -> None:
         if len(angles) != rows[name]:
             text = f"has {len(angles)} angles; {name} has {rows[name]} rows, give one for each"
             raise loaded.error(("view", "scene", "beams", name), text)
-    known = (*model.state_names, *(parameter.name for parameter in model.parameters))
+    known = (*estimated_names(model), *(parameter.name for parameter in model.parameters))
     for name, place in scene.beacons.items():
         at = ("view", "scene", "beacons", name)
         if rows[name] != 1:
@@ -93,19 +92,24 @@ def check_names(loaded: Loaded, key: Key, given: Any, known: Any, kind: str, mod
     Raises:
         ConfigError: With file and line, and the near names.
     """
-    names = known if isinstance(known, CellNames) else frozenset(known)
     for name in given:
-        if name not in names:
+        if name not in known:
             raise loaded.error((*key, name), f"is no {kind} of {model.name}; {nearest(name, known)}")
 
 
+def estimated_names(model: StateSpaceModel) -> Sequence[str]:
+    """Return the names of the states without those of considered parameters, which are named in no YAML."""
+    names = model.state_names
+    return names[: model.nx - model.considered] if model.considered else names
+
+
 def check_named(loaded: Loaded, key: Key, names: Any, model: StateSpaceModel) -> None:
-    """Refuse a state that the value at `key` names and the model does not have.
+    """Refuse a state that the value at `key` names and the model does not estimate.
 
     Raises:
         ConfigError: With file and line, and the near names.
     """
-    _check_names(loaded, key, names, model.state_names, f"state of {model.name}")
+    _check_names(loaded, key, names, estimated_names(model), f"state of {model.name}")
 
 
 def check_refit(loaded: Loaded, estimator: str, tuning: Tuning) -> None:

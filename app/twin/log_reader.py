@@ -80,7 +80,8 @@ def read_log(twin: Twin, duration: float | None, *, blind: bool = False) -> tupl
             beside.advance()
 
     remark = remarking(count)
-    source = twin.open_source(remark, live=False)
+    faults = twin.plan.faults()
+    source = twin.open_source(remark, live=False, faults=faults)
     if duration is None and is_endless(source):
         source.close()
         raise SourceError(f"{twin.name}: its source has no end; give --duration SECONDS")
@@ -104,6 +105,9 @@ def read_log(twin: Twin, duration: float | None, *, blind: bool = False) -> tupl
         files = ", ".join(map(str, twin.plan.log_files or ()))
         place = f"--log {files}" if files else twin.loaded.places.at(("source",))
         raise SourceError(f"{place}: the source has no values for any sensor; check the channel maps")
+    for fault in (item.fault for item in faults.status() if item.since is None):
+        ends = f"the log ends after {log.events.seconds:.6g} s"
+        complain(f"the {fault.kind} of {fault.target} begins after {fault.start:g} s and has no effect: {ends}")
     return log, +counts
 
 

@@ -18,7 +18,7 @@ from config.loader import Loaded, shown_path
 from config.model_schema import FmuSection, MatricesSection, Model
 from config.schema import ParameterSection, PriorSection, SensorSection, TwinSection
 from config.yaml_files import Key, dotted
-from estimators.errors import ConfigError, ModelError, NisusError, nearest
+from estimators.errors import ConfigError, ModelError, NisusError, nearest, spaced
 from estimators.model.assemble import AppendError, JointParameter, assemble
 from estimators.model.coloured import ColouredError, disturbance_time, error_time
 from estimators.model.hybrid import learned_noise
@@ -29,7 +29,7 @@ from estimators.model.user_file import imported_beside, run_file
 from estimators.models import MODELS
 from estimators.plausibility import DAY, surprise
 
-from .checks import check_named, check_names, one_each
+from .checks import check_named, check_names, estimated_names, one_each
 from .defaults import instrument_sections, parameter_sections
 from .fmu import fmu_model
 from .landmarks import expanded
@@ -139,14 +139,13 @@ def configure(model: StateSpaceModel, loaded: Loaded) -> StateSpaceModel:
     config = loaded.config
     model = _assembled(_with_noise(with_parameters(model, loaded), loaded), loaded)
     field = isinstance(model.states, Field)
-    states = () if field else model.state_names  # a field may have a million
-    places = [*states, *(item.name for item in model.inputs)]
+    own = () if field else estimated_names(model)  # a field may have a million
+    places = [*own, *(item.name for item in model.inputs)]
     check_names(loaded, ("valid",), config.valid, places, "state or input", model)
     for key in ("withhold", "possible"):
-        check_names(loaded, (key,), getattr(config, key), states, "state", model)
+        check_names(loaded, (key,), getattr(config, key), own, "state", model)
     check_named(loaded, ("watched",), config.watched or (), model)
-    own = states[: model.nx - model.considered]
-    for name in states[len(own) :]:
+    for name in () if field else model.state_names[len(own) :]:
         if name in config.prior:
             raise loaded.error(
                 ("prior", name), "is considered, so its prior is the `std` of the parameter; give it there"
@@ -263,7 +262,10 @@ def _instruments(model: StateSpaceModel, loaded: Loaded) -> dict[str, dict[str, 
     for item, key in _instrument_keys(config, found).items():
         section = found[str(key[1])][item]
         if key[2] == "scale" and not _value(item, section) > 0.0:
-            raise loaded.error(key, f"is {section.value:g}; it must be positive")
+            turned = f"a sign belongs to the source, as in source.{key[0]}.{key[1]}: {{..., scale: -1}}"
+            raise loaded.error(key, f"is {section.value:g}; it must be positive: {turned}")
+        if not section.model_fields_set:
+            raise loaded.error(key, "gives neither value nor std; add one")
     return found
 
 
@@ -332,21 +334,18 @@ def _states(model: StateSpaceModel, loaded: Loaded) -> Sequence[State]:
                 "is 0; that of a field must be positive, or its members would be alike",
             )
         means = states.means if prior.mean is None else ()
-        return replace(
-            states, mean=states.mean if prior.mean is None else prior.mean, means=means, std=prior.std or states.std
-        )
+        return replace(states, means=means, **prior.model_dump(exclude_none=True))
     found = []
-    for state in states:
+    for state in _ranged(states, loaded):
         prior = given.get(state.name, PriorSection())
         state = replace(
             state,
-            mean=state.mean if prior.mean is None else prior.mean,
-            std=state.std if prior.std is None else prior.std,
+            **prior.model_dump(exclude_none=True),
             withhold=loaded.config.withhold.get(state.name, state.withhold),
             watched=state.name in (loaded.config.watched or (state.name,)),
         )
         found.append(replace(state, limits=_possible(state, loaded)))
-    return _ranged(tuple(found), loaded)
+    return tuple(found)
 
 
 POSITIVE = ("K", "kg")
@@ -354,18 +353,27 @@ POSITIVE = ("K", "kg")
 
 
 def _possible(state: State, loaded: Loaded) -> tuple[float, float] | None:
-    """Return the physical limits of a state: those of the YAML, else of the model, else of its unit."""
-    given = loaded.config.possible.get(state.name)
-    if given is None:
-        positive = state.unit in POSITIVE and state.mean > 2.0 * state.std
-        return state.limits or ((0.0, inf) if positive else None)
-    low, high = bounds((given.min, given.max))
-    if not low <= state.mean <= high:
-        raise loaded.error(
-            ("possible", state.name),
-            f"is {low:g} to {high:g} {state.unit}, and its prior has the mean {state.mean:g}; change one of them",
-        )
-    return low, high
+    """Return the physical limits of a state: those of the YAML, else of the model, else of its unit.
+
+    Raises:
+        ConfigError: If a range of the YAML has no point within them, or the prior's mean lies beyond.
+    """
+    given, positive = loaded.config.possible.get(state.name), state.unit in POSITIVE and state.mean > 2.0 * state.std
+    own = state.limits or ((0.0, inf) if positive else None)
+    limits = own if given is None else bounds((given.min, given.max))
+    for key, pair, other in (("possible", limits, own), ("valid", state.fitted, limits)):
+        if pair and other and (pair[0] > other[1] or pair[1] < other[0]):
+            text = f"is {_ends(pair, state)}, outside the physical limits, {_ends(other, state)}"
+            raise loaded.error((key, state.name), f"{text}; give it in the unit of the state")
+    if limits and not limits[0] <= state.mean <= limits[1]:
+        at: Key = ("prior", state.name, "mean") if given is None else ("possible", state.name)
+        text = f"does not fit: the prior has the mean {state.mean:g}, and possible is {_ends(limits, state)}"
+        raise loaded.error(at, f"{text}; change one of them")
+    return limits
+
+
+def _ends(pair: tuple[float, float], state: State) -> str:
+    return f"{pair[0]:g} to {pair[1]:g}{spaced(state.unit)}"
 
 
 def _ranged(items: Any, loaded: Loaded) -> Any:

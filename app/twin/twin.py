@@ -29,7 +29,7 @@ from estimators.registry import checked, find_entry, find_estimator
 from estimators.tuning import CHANGED_MARK, Tuning
 
 from ..ingest import Planned, UnknownInputs
-from .checks import check_named, check_outputs, check_refit, check_scene, commissioned
+from .checks import check_named, check_names, check_outputs, check_refit, check_scene, commissioned
 from .defaults import DegradedAfter, Late, degraded_after, driven_states, late_policy, parameter_sections
 from .landmarks import expanded
 from .learned import correction_files
@@ -294,7 +294,7 @@ def _assemble(loaded: Loaded, overrides: Mapping[str, str], log_files: Sequence[
     if config.time.paused_after is not None and not driven_states(model):
         raise loaded.error(("time", "paused_after"), f"is for inputs, and none drives {model.name}; leave it out")
     for k, item in enumerate(config.maintenance):
-        check_named(loaded, ("maintenance", k, "states"), item.states, model)
+        check_names(loaded, ("maintenance", k, "states"), item.states, model.state_names, "state", model)
         if len(set(item.states)) != len(item.states):
             raise loaded.error(("maintenance", k, "states"), "names a state twice; name each once")
     believed = (loaded, model) if asset is None else (asset[1], configure(*asset))

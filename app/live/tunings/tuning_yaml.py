@@ -74,9 +74,11 @@ def tuning_yaml(
     if widths is not None or not whole:
         lines += as_section("valid", _fitted_ranges(config, model, widths))
     if prior is not None:
-        own = model.state_names[: model.nx - model.considered]  # the prior of the others is that of their parameters
-        beliefs = zip(own, prior[0].tolist(), np.sqrt(np.diag(prior[1])).tolist(), strict=False)
-        lines += as_section("prior", {name: {"mean": mean, "std": std} for name, mean, std in beliefs})
+        own = model.states[: model.nx - model.considered]  # the prior of the others is that of their parameters
+        ends = np.array([state.limits or (-np.inf, np.inf) for state in own])
+        means = np.clip(prior[0][: len(own)], *ends.T).tolist()  # a fit may end a little beyond what is possible
+        beliefs = zip(own, means, np.sqrt(np.diag(prior[1])).tolist(), strict=False)
+        lines += as_section("prior", {state.name: {"mean": mean, "std": std} for state, mean, std in beliefs})
     errors = {sensor.name: [noises.pop(name) for name in errors_of(sensor)] for sensor in erring}
     over = {name: {"over": values.get(disturbance_time(name), seconds)} for name, seconds in lasting.items()}
     ranges = bounds_of(config, model)

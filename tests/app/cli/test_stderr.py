@@ -62,6 +62,14 @@ def test_a_recording_without_rows_is_named_and_so_is_one_that_feeds_nothing(driv
     )
 
 
+def test_a_fault_after_the_end_is_said_to_have_no_effect(drive, capsys):
+    late = "faults=[{kind: bias, sensor: winding, start: 4000, size: 1}, {kind: silence, start: 2}]"
+    assert main(["fold", str(drive / "drive.yaml"), "--set", late]) == 0
+    said = [line for line in capsys.readouterr().err.splitlines() if "effect" in line]
+    # The silence begins with the last row.
+    assert said == ["nisus: the bias of winding begins after 4000 s and has no effect: the log ends after 2 s"]
+
+
 @pytest.mark.parametrize("arguments", [["fold"], ["run", "--headless", "--speed", "inf"]])
 def test_times_that_run_backwards_are_said_once(drive, arguments, capsys):
     rows = "".join(f"{60 - k},40,20,0\n" for k in range(60))

@@ -220,32 +220,15 @@ def test_the_prior_of_what_is_considered_is_that_of_the_parameter():
     assert "winding: {mean" in written and "yoke_coolant_deviation" not in written
 
 
-@pytest.mark.parametrize(
-    ("parameters", "said"),
-    [
-        ("{yoke_coolant: {value: 0.2, use: considered}}", "is considered and needs a standard deviation, as in std: 10 %"),
-        ("{yoke_coolant: {std: 1 %, correlation: {yoke_coolant: 0.5}}}", "is with itself; give each pair once"),
-        ("{yoke_coolant: {std: 1 %, correlation: {iron_magnet: 0.5}}, iron_magnet: {std: 1 %, correlation: {yoke_coolant: -0.5}}}", "is 0.5 here and -0.5 under iron_magnet; give each pair once"),
-        ("{yoke_coolant: {std: 1 %, correlation: {iron_magnt: 0.5}}}", "correlation.iron_magnt is no parameter of motor_drive; did you mean iron_magnet"),
-        *(
-            (
-                f"{{yoke_coolant: {{std: {width}}}}}",
-                f"parameters.yoke_coolant.std is {width!r}; give a positive number without a unit, or a share of the "
-                "value above zero, as in 10 %",
-            )
-            for width in ("-10 %", "10 %%", "5 cm²", "0 %")
-        ),
-    ],
-)  # fmt: skip
-def test_a_width_is_given_once_and_as_a_number_or_share(parameters, said):
-    assert said in refusal(f"model: motor_drive\nparameters: {parameters}\nsource: {{type: simulator}}\n")
+def test_a_fitted_prior_ends_where_the_state_does():
+    twin = twin_of("model: battery_cell\nsource: {type: simulator}\n")
+    beyond = (twin.model.prior_mean + [0.502, 0.0, 0.0], twin.model.prior_cov)
+    assert "soc: {mean: 1, std: 0.3}" in tuning_yaml(twin.config, twin.estimator, twin.tuning, beyond)
 
 
-@pytest.mark.parametrize("given", ["parameters: {forcing: {std: 10 %}}", "estimate: {forcing: {std: 0.1}}"])
-def test_the_parameters_of_a_field_are_held(given):
-    assert "is uncertain, and lorenz96 is a field" in refusal(
-        f"model: lorenz96\n{given}\nsource: {{type: simulator}}\n"
-    )
+@cases(__file__, "refused.csv")
+def test_what_cannot_be_meant_is_refused(model, section, said):
+    assert said in refusal(f"model: {model}\n{section}\nsource: {{type: simulator}}\n")
 
 
 def test_a_width_is_added_to_a_parameter_given_as_a_number():
@@ -278,19 +261,3 @@ def test_an_offset_leaves_a_linear_model_to_the_kalman_filter():
     assert twin_of(MOTOR.replace("{std: 3}", "{std: 3, offset: {std: 0.5}}")).model.linear
     scale = MOTOR.replace("{std: 3}", "{std: 3, scale: {std: 1 %}}")
     assert "not linear once winding_scale_deviation are considered" in refusal(scale)
-
-
-@pytest.mark.parametrize(
-    ("section", "message"),
-    [
-        ("inputs: {power: {offset: {std: 1}}}", "inputs.power is no input of motor_winding"),
-        ("sensors: {winding: {offset: {std: 1 %}}}",
-         "motor.yaml:2: sensors.winding.offset.std is 1 % of 0; give it in the unit of the value"),
-        ("sensors: {winding: {scale: -1}}", "motor.yaml:2: sensors.winding.scale is -1; it must be positive"),
-        ("sensors: {winder: {scale: {std: 1 %}}}", "motor.yaml:2: sensors.winder is no sensor of motor_winding"),
-        ("prior: {winding_offset_deviation: {std: 1}}\nsensors: {winding: {offset: {std: 1}}}",
-         "prior.winding_offset_deviation is considered, so its prior is the `std` of the parameter"),
-    ],
-)  # fmt: skip
-def test_impossible_offsets_are_refused(section, message):
-    assert message in refusal(f"model: motor_winding\n{section}\nsource: {{type: simulator}}\n")
