@@ -73,7 +73,7 @@ def fold_twin(arguments: Arguments) -> int:
     seconds = (time.perf_counter() - begun) / log.n
     part = rows_of(log, span_of(arguments, log.events))
     events, track = log.events.select(part), fold.track.select(part)
-    pictures = [one for one in pictures_of(fold) if part.start < one.before <= part.stop]
+    pictures = pictures_of(fold, part)
     smoothed: Smoothed | None = attend(twin.model, lambda: smooth(fold), "smoothing") if arguments.smooth else None
     result = FoldResult(
         twin,

@@ -240,10 +240,7 @@ def progress(
 def progress_text(title: str, done: int, total: int, unit: str, seconds: float) -> str:
     """`lorenz63: 3 of 12 filters after 30 s, about 90 s left`, if those to come take as long as those done."""
     text = f"{title}: {done} of {total} {unit} after {seconds:.0f} s"
-    return f"{text}, about {left_text(done, total, seconds)} left" if done else text
-
-
-def left_text(done: int, total: int, seconds: float) -> str:
-    """Return the time that the rest takes at the rate so far."""
+    if not done:
+        return text
     left = seconds / done * (total - done)
-    return f"{left:.0f} s" if left < 100.0 else f"{left / 60.0:.0f} min"
+    return f"{text}, about {f'{left:.0f} s' if left < 100.0 else f'{left / 60.0:.0f} min'} left"

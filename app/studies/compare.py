@@ -90,7 +90,7 @@ def able(twin: Twin, estimator: str) -> Twin:
 
 def within(events: Events, span: float | None) -> Events:
     """The events of the first `span` seconds."""
-    if span is None:
+    if span is None or not len(events):
         return events
     return events.select(slice(0, int(np.searchsorted(events.t, events.t[0] + round(span * 1e9), side="right"))))
 
@@ -140,7 +140,7 @@ def outcome_of(fold: Fold, events: Events, seconds: float, scored: tuple[int, in
     if part.start >= part.stop:
         raise EstimatorError("its budget ends before the scored part; raise --budget")
     fold.finish()
-    pictures = [one for one in pictures_of(fold) if part.start < one.before <= part.stop]
+    pictures = pictures_of(fold, part)
     model, track, events = fold.model, fold.track.select(part), events.select(part)
     result = score(track, events, model, pictures, gate=fold.tuning.gate, baseline=fold.tuning.baseline)
     fits, units = result.states, units_by_name(model)

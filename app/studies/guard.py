@@ -12,8 +12,6 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
-import numpy as np
-
 from config.companion_schema import AcceptedSection, FigureSection, ReferenceSection
 from config.loader import find, shipped
 from config.source_schema import SimulatorSection
@@ -39,7 +37,7 @@ from .baseline import (
     read_baseline,
     write_baseline,
 )
-from .compare import draws, tidy
+from .compare import draws, tidy, within
 from .processes import results
 
 SIMULATED_LOGS = 3  # logs of a simulated asset, with consecutive seeds
@@ -223,10 +221,7 @@ def logs_of(guarded: GuardedLog, twin: Twin, span: float | None) -> Iterator[tup
         from ..views.recording.reader import read_recording
 
         recorded = read_recording(guarded.recording)
-        log = Log.resume(twin.model, None, recorded.events)
-        if span is not None and log.n:
-            log.n = int(np.searchsorted(log.t[: log.n], log.t[0] + round(span * 1e9), side="right"))
-        yield log, recorded.base_for(twin.model)[0]
+        yield Log.resume(twin.model, None, within(recorded.events, span)), recorded.base_for(twin.model)[0]
         return
     source = twin.config.source
     if not isinstance(source, SimulatorSection):

@@ -68,9 +68,10 @@ class FilterScore:
     failure: str = ""
 
 
-def pictures_of(fold: Fold) -> list[Picture]:
-    """Return the pictures that a fold took of a large field."""
-    return [] if fold.pictures is None else fold.pictures.taken
+def pictures_of(fold: Fold, part: slice | None = None) -> list[Picture]:
+    """Return the pictures that a fold took of a large field, or those of a part of its rows."""
+    taken = [] if fold.pictures is None else fold.pictures.taken
+    return taken if part is None else [one for one in taken if part.start < one.before <= part.stop]
 
 
 def spread(title: str) -> str:

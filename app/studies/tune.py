@@ -50,7 +50,8 @@ def window_topics(found: Sequence[tuple[int, WindowFit]], origins: Sequence[int]
         rows = []
         unit = ""
         for k, refit in found:
-            line = _line_of(refit, key)
+            lines = () if refit.fitted is None else refit.fitted.lines
+            line = next((line for line in lines if line.key == key), None)
             unit = unit or ("" if line is None else line.unit)
             rows.append((*_place(k, refit, origins), *_window_row(refit, line)))
         title = f"{key}{f', {unit}' if unit else ''}"
@@ -64,11 +65,6 @@ def _place(k: int | None, refit: WindowFit | None, origins: Sequence[int]) -> tu
         return (*(("recording",) if len(origins) > 1 else ()), "from s", "to s")
     at = (f"{(t - origins[k]) * 1e-9:,.0f}" for t in (refit.start, refit.end))
     return (*((str(k + 1),) if len(origins) > 1 else ()), *at)
-
-
-def _line_of(refit: WindowFit, key: str) -> EntryFit | None:
-    lines = () if refit.fitted is None else refit.fitted.lines
-    return next((line for line in lines if line.key == key), None)
 
 
 def _window_row(refit: WindowFit, line: EntryFit | None) -> tuple[str, ...]:

@@ -65,11 +65,10 @@ def _model(path: Path, section: FmuSection, places: Loaded) -> StateSpaceModel:
         names = {name if item.name == variable else key: item for key, item in names.items()}
     if len(names) < len(states):
         raise places.error(("model", "states"), "gives two states one name; every name must differ")
-    inputs = {variable_name(item.name): item.name for item in found.reals.values() if item.causality == "input"}
-    inputs = inputs if section.inputs is None else section.inputs
+    inputs = found.named("input") if section.inputs is None else section.inputs
     given = section.sensors
     if given is None:
-        given = {variable_name(item.name): item.name for item in found.reals.values() if item.causality == "output"}
+        given = found.named("output")
         if not given:
             raise places.error(("model",), "names no sensors, and the FMU has no real output; give sensors")
     sensors = {name: {name: rows} if isinstance(rows, str) else rows for name, rows in given.items()}
@@ -152,6 +151,10 @@ class _Variables:
             rule = nearest(name, self.reals) if self.reals else "it has none"
             raise self._places.error(key, f"names {name!r}, no real variable of the FMU; {rule}")
         return self.reals[name]
+
+    def named(self, causality: str) -> dict[str, Any]:
+        """Return the variables that are inputs, or outputs, by their names in a model."""
+        return {variable_name(item.name): item.name for item in self.reals.values() if item.causality == causality}
 
     def unit(self, item: Any) -> str:
         """Return the unit of a variable."""

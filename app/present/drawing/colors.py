@@ -21,7 +21,8 @@ from estimators.track import HEALTH_NAMES, Track
 
 RGB = tuple[int, int, int]
 
-STYLE = Path(__file__).resolve().parents[2] / "web" / "page" / "chart.css"
+PAGE = Path(__file__).resolve().parents[2] / "web" / "page"
+"""The page's files, as installed beside this package."""
 
 
 def rgb(color: str) -> RGB:
@@ -57,7 +58,7 @@ class Palette:
 
 def _palette(selector: str) -> Palette:
     """Return the colours that a rule of the page's style sheet sets."""
-    rule = STYLE.read_text().partition(f"{selector} {{")[2].partition("\n}")[0]
+    rule = (PAGE / "chart.css").read_text().partition(f"{selector} {{")[2].partition("\n}")[0]
     found = {name: rgb(color) for name, color in re.findall(r"--([\w-]+): (#[0-9a-f]{6});", rule)}
     names = [item.name for item in fields(Palette) if item.name != "health"]
     return Palette(

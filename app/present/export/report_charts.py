@@ -10,7 +10,6 @@ import json
 import posixpath
 import re
 from collections.abc import Mapping, Sequence
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -26,14 +25,12 @@ from estimators.tuning import Tuning
 
 from ...live.notices import Annotation
 from ...live.outputs import Pull
+from ..drawing.colors import PAGE
 from ..drawing.direct_readings import measured_by
 from ..sensor_groups import sensor_groups
 from ..series.chart_stream import ChartQuery, ChartStream
 from ..series.charted_run import ChartedRun, KeptRows
 from ..series.columns import columns_of, rows_of
-
-PAGE = Path(__file__).resolve().parents[2] / "web" / "page"
-"""The page's files, as installed beside this package."""
 
 MAX_GROUPS = 400
 """Groups of rows, of each of which the extremes are drawn."""

@@ -99,9 +99,8 @@ def rows_of(model: StateSpaceModel) -> list[tuple[str, int, int]]:
 
 
 def units_by_name(model: StateSpaceModel) -> dict[str, str]:
-    """Return the unit of every charted state and every row of a measurement, by name."""
-    units = {state.name: state.unit for state in model.shown_states}
-    return units | {name: model.sensors[sensor].rows[row].unit for name, sensor, row in rows_of(model)}
+    """Return the unit of every charted state, input and row of a measurement, by name."""
+    return model.units | {name: model.sensors[sensor].rows[row].unit for name, sensor, row in rows_of(model)}
 
 
 def _mean(j: int, spread: float, rows: Rows, withhold: float = np.inf) -> np.ndarray:

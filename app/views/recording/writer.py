@@ -119,9 +119,7 @@ class Recorder:
                 if self._open is not None and wanted != self._open.asked:
                     self._finish(self._open)
                 if self._open is None and wanted is not None:
-                    self._open = RecordingPart(self._engine, wanted, self._draw)
-                    self._engine.notices.say(f"recording into {self._open.file.path}")
-                    self._remove_surplus(self._open)
+                    self._begin(wanted, "recording into")
                 if self._open is not None:
                     self._go_on(self._open)
             except NisusError as error:
@@ -152,12 +150,13 @@ class Recorder:
             raise SourceError(f"{part.file.path}: the disk is nearly full; the recording up to here can be reviewed")
         if part.due(self._split):
             self._finish(part, goes_on=True)
-            self._open = RecordingPart(self._engine, part.asked, self._draw, before=part)
-            self._engine.notices.say(f"recording on into {self._open.file.path}")
-            self._remove_surplus(self._open)
+            self._begin(part.asked, "recording on into", part)
 
-    def _remove_surplus(self, part: RecordingPart) -> None:
-        for path in surplus_parts(part.asked, self._split, part.file.path):
+    def _begin(self, asked: Path, what: str, before: RecordingPart | None = None) -> None:
+        """Begin a part, and remove those that are too many or too old by then."""
+        self._open = part = RecordingPart(self._engine, asked, self._draw, before=before)
+        self._engine.notices.say(f"{what} {part.file.path}")
+        for path in surplus_parts(asked, self._split, part.file.path):
             try:
                 path.unlink()
             except OSError as error:

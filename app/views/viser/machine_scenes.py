@@ -26,6 +26,15 @@ CELLS_PER_ROW = 4
 MIN_SLAB_HEIGHT = 0.004  # Smallest height of a slab
 
 
+def _centred(root: viser.FrameHandle, reach: tuple[float, float], height: tuple[float, float], up: float) -> Outlook:
+    """Move the middle of a machine to the origin, from where it reaches ± `reach` across and deep; return the view."""
+    middle = np.array([0.0, 0.0, 0.5 * sum(height)])
+    root.position = -middle
+    across, deep = reach
+    corners = np.array([[x, y, z] for x in (-across, across) for y in (-deep, deep) for z in height])
+    return Outlook(corners - middle, np.array([0.0, -1.0, up]))
+
+
 class BatteryScene:
     """Cells side by side, and below them the scale of their temperatures."""
 
@@ -58,11 +67,8 @@ class BatteryScene:
             unit = model.states[self._temperature[0]].unit
             self._bar = ScaleBar(shapes.below("scale"), labels, unit, palette, y=0.0, top=low - 0.15)
             low = self._bar.bottom
-        top, wide = HEIGHT + 0.3, max(1.05, 0.5 * columns * PITCH)
-        middle = np.array([0.0, 0.0, 0.5 * (low + top)])
-        corners = np.array([[x, 0.0, z] for x in (-wide, wide) for z in (low, top)])
-        self.root.position = -middle
-        self.outlook = Outlook(corners - middle, np.array([0.0, -1.0, 0.16]))
+        wide = max(1.05, 0.5 * columns * PITCH)
+        self.outlook = _centred(self.root, (wide, 0.0), (low, HEIGHT + 0.3), 0.16)
 
     def draw(self, history: History, belief: Belief, heavy: bool = True) -> None:
         """Send charge and temperature of the cells."""
@@ -304,10 +310,7 @@ class MotorScene:
         ]
         unit = model.states[self._states[0]].unit
         self._bar = ScaleBar(shapes.below("scale"), list(parts), unit, palette, y=-0.8, top=-1.15)
-        corners = np.array([[x, y, z] for x in (-1.05, 1.05) for y in (-0.8, 0.8) for z in (self._bar.bottom, 1.02)])
-        middle = np.array([0.0, 0.0, 0.5 * (self._bar.bottom + 1.02)])
-        self.root.position = -middle
-        self.outlook = Outlook(corners - middle, np.array([0.0, -1.0, 0.28]))
+        self.outlook = _centred(self.root, (1.05, 0.8), (self._bar.bottom, 1.02), 0.28)
 
     def draw(self, history: History, belief: Belief, heavy: bool = True) -> None:
         """Send the present colours."""
