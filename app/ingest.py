@@ -10,6 +10,8 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from estimators.diagnostics.episodes import Episode
+from estimators.errors import spaced
+from estimators.events.arrays import blank
 from estimators.events.clocks import ClockGuard, Moved, Passed, Refused
 from estimators.events.maintenance import maintained
 from estimators.log import BEFORE, INPUT, READING, TICK, Events
@@ -19,6 +21,8 @@ from sources.source import WRONG_TIME, Report
 CLOCK_MOVED = "clock moved"  # key of jumps of a source's clock
 MAINTENANCE = "maintenance"  # key of maintenance
 PAUSED = "paused"  # key of pauses of a source, over which inputs are unknown
+UNSET = "input without value"  # key of inputs whose first value comes late
+MAX_UNSET_S = 3.0  # seconds after the first event for which an input may have no value
 PAUSE_PERIODS = 3.0  # median periods of a source beyond which a gap may be a pause: some log once a minute
 GAP_PERIODS = 10.0  # the same beyond which predictions are shown in a gap of a recording
 GAP_QUERIES = 20  # predictions in a gap
@@ -81,6 +85,7 @@ class Ingest:
         self._unknown = None if horizon is None else unknown
         self._gap = None if horizon is None else gap
         self._newest = BEFORE
+        self._first, self._unset = np.iinfo(np.int64).max, {*range(model.nu)}
         self._periods = deque[int](maxlen=PERIODS)
 
     @property
@@ -107,6 +112,7 @@ class Ingest:
             ValueError: If it is of another model.
         """
         self._newest = int(state["newest"])
+        self._unset.clear()
         self._periods.extend(state["periods"])
         self._planned = [item for item in self._planned if item.at > newest]
         if self._guard is not None and state["guard"] is not None:
@@ -133,7 +139,20 @@ class Ingest:
             item = self._planned.pop(0)
             self._report(MAINTENANCE, maintenance_text(item.what, item.states, self._model))
             passed = self._restart(passed, item.at, item.states)
+        self._tell_unset(passed.events)
         return passed if self._unknown is None and self._gap is None else self._paused(passed)
+
+    def _tell_unset(self, events: Events) -> None:
+        """Report the inputs that now have their first value, and had none for a while."""
+        self._first = int(events.t.min(initial=self._first))
+        inputs = events.select(events.kind == INPUT)
+        known = np.isfinite(inputs.value)
+        for j in self._unset & {*np.flatnonzero(known.any(axis=0)).tolist()}:
+            self._unset.remove(j)
+            item, late = self._model.inputs[j], (inputs.t[known[:, j]].min() - self._first) * 1e-9
+            if late > MAX_UNSET_S:
+                used = f"{item.default:g}{spaced(item.unit)} was used in its place"
+                self._report(UNSET, f"{item.name} has no value in the first {late:.4g} s: {used}")
 
     def _paused(self, passed: Passed) -> Passed:
         """Return the events with queries in each gap, and a restart of the driven states at the end of each pause."""
@@ -155,7 +174,7 @@ class Ingest:
             if self._gap is not None and periods[k] > max(self._gap, GAP_PERIODS * (usual or np.inf)):
                 shares = np.linspace(0.0, 1.0, GAP_QUERIES + 1)[1:] ** 2  # denser where the variance grows fastest
                 times = newest[k] + (shares * (periods[k] - 1)).astype(np.int64)
-                passed = self._with(passed, queries(times, self._model.width))
+                passed = self._with(passed, blank(times, TICK, 0, self._model.width))
             if unknown is None or periods[k] <= max(unknown.after, PAUSE_PERIODS * usual):
                 continue
             length = periods[k] * 1e-9
@@ -190,12 +209,6 @@ def dropped_episode(start: float, lost: int, taken: int) -> Episode:
         "times; check the times of the source, or lengthen time.horizon"
     )
     return Episode(start, None, "twin", "dropped", lost / taken, math.nan, math.nan, "", text)
-
-
-def queries(times: np.ndarray, width: int) -> Events:
-    """Return queries at times (n,), ns, for a log of so many value columns."""
-    kinds, none = np.full(times.size, TICK, np.int8), np.zeros(times.size, np.int32)
-    return Events(times, times, kinds, none, np.full((times.size, width), np.nan))
 
 
 def refusal(name: str, refused: Refused) -> str:

@@ -18,14 +18,14 @@ from sources.source import LOST_FRAMES, NEVER, NO_ASSET, TRUNCATED, UNASSIGNED, 
 from sources.tables.order import REMARKS as ORDER
 from sources.tables.text import UNREADABLE
 
-from ..ingest import CLOCK_MOVED, Ingest
+from ..ingest import CLOCK_MOVED, UNSET, Ingest
 from ..terminal import complain
 from .twin import Twin, load_twin
 
 if TYPE_CHECKING:
     from estimators.events.clocks import Passed
 
-REMARKS = (*ORDER, NEVER, TRUNCATED, CLOCK_MOVED)
+REMARKS = (*ORDER, NEVER, TRUNCATED, CLOCK_MOVED, UNSET)
 
 BROKERS = (NO_BROKER, REFUSED_MESSAGE, REFUSED_TOPIC)
 

@@ -38,7 +38,7 @@ def readings(model: StateSpaceModel, sensor: str, seconds: Any, values: Any, var
     t = nanoseconds("seconds", seconds)
     y = _rows(f"values of {sensor}", values, t.size, rows)
     width = model.width + (model.ny if variance is not None else 0)
-    batch = _blank(t, READING, index, width)
+    batch = blank(t, READING, index, width)
     batch.value[:, :rows] = y
     if variance is not None:
         given = _numbers(f"variance of {sensor}", variance)
@@ -62,7 +62,7 @@ def inputs(model: StateSpaceModel, seconds: Any, named: Mapping[str, Any]) -> Ev
     if not named:
         raise EventError(f"add_inputs: no input is given; {nearest('', model.input_names)}")
     t = nanoseconds("seconds", seconds)
-    batch = _blank(t, INPUT, 0, model.width)
+    batch = blank(t, INPUT, 0, model.width)
     for name, values in named.items():
         batch.value[:, _index("input", name, model.input_names, model)] = _column(name, values, t.size)
     return batch
@@ -79,7 +79,7 @@ def truth(model: StateSpaceModel, seconds: Any, named: Mapping[str, Any]) -> Eve
     blocks: list[Events] = []
     for state in sorted(known):
         if not blocks or state >= int(blocks[-1].channel[0]) + model.width:
-            blocks.append(_blank(t, TRUTH, state, model.width))
+            blocks.append(blank(t, TRUTH, state, model.width))
         first = int(blocks[-1].channel[0]) if t.size else 0
         blocks[-1].value[:, state - first] = known[state]
         if not t.size:
@@ -89,10 +89,10 @@ def truth(model: StateSpaceModel, seconds: Any, named: Mapping[str, Any]) -> Eve
 
 def ticks(width: int, seconds: Any) -> Events:
     """Return queries; see `Log.add_ticks`."""
-    return _blank(nanoseconds("seconds", seconds), TICK, 0, width)
+    return blank(nanoseconds("seconds", seconds), TICK, 0, width)
 
 
-def _blank(t: np.ndarray, kind: int, channel: int, width: int) -> Events:
+def blank(t: np.ndarray, kind: int, channel: int, width: int) -> Events:
     """Return events with values of NaN, which arrive when they are measured."""
     n = t.size
     return Events(t, t.copy(), np.full(n, kind, np.int8), np.full(n, channel, np.int32), np.full((n, width), np.nan))

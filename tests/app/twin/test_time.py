@@ -88,9 +88,9 @@ def test_maintenance_of_the_yaml_is_in_the_fold(tmp_path, capsys):
     assert table.tuning_version.nunique() == 1
 
 
-def paused(tmp_path, times, after):
-    """A cell whose tester wrote rows at these times, its log, and counts."""
-    (tmp_path / "log.csv").write_text("\n".join(["t,i,v,c", *(f"{t},1.0,3.6,25.0" for t in times)]))
+def paused(tmp_path, times, after, known=0):
+    """A cell whose tester wrote rows at these times, with a current from `known` on, its log, and counts."""
+    (tmp_path / "log.csv").write_text("\n".join(["t,i,v,c", *(f"{t},{'1' * (t >= known)},3.6,25.0" for t in times)]))
     path = tmp_path / "cell.yaml"
     path.write_text(
         "model: battery_cell\nestimate: {r0: {std: 0.005}}\nprior: {soc: {mean: 0.45, std: 0.2}}\n"
@@ -115,6 +115,12 @@ def test_inputs_are_unknown_over_a_pause(tmp_path):
     np.testing.assert_allclose(fold.track.std[rows[-1], :3], [0.2, 0.02, 3.0], rtol=1e-12)
     assert fold.track.std[rows[-1], 3] < 0.005
     assert counts["paused"] == 1
+
+
+def test_an_input_whose_first_value_is_late_is_told(tmp_path, capsys):
+    for known, count in ((3, 0), (20, 1)):
+        assert paused(tmp_path, range(50), 60, known)[2]["input without value"] == count
+    assert "nisus: current has no value in the first 20 s: 0 A was used in its place\n" in capsys.readouterr().err
 
 
 def test_a_logger_of_one_row_a_minute_does_not_pause_all_the_time(tmp_path):
@@ -171,11 +177,6 @@ def test_a_gap_has_rows_of_the_prediction_and_changes_no_other(tmp_path, gap, de
         assert fold.track.mean[last, 0] == pytest.approx(predicted, rel=1e-9)
         assert fold.track.std[last, 0] ** 2 == pytest.approx(variance, rel=1e-6)
         assert {fold.track.health[row] for row in (first, last)} == {fold.track.health[first - 1], STALE}
-
-
-def test_a_pause_of_a_model_without_inputs_is_refused(tmp_path):
-    with pytest.raises(ConfigError, match="motor.yaml:3: time.paused_after is for inputs, and none drives"):
-        load_twin(made(tmp_path, "paused_after: 60"))
 
 
 @pytest.mark.parametrize("how", ["exact", "inflate"])

@@ -213,8 +213,6 @@ def test_the_prior_of_what_is_considered_is_that_of_the_parameter():
     text = "model: motor_drive\nparameters: {yoke_coolant: {std: 10 %}}\nsource: {type: simulator}\n"
     twin = twin_of(text)
     assert twin.model.states[-1].name == "yoke_coolant_deviation"
-    said = refusal(text + "prior: {yoke_coolant_deviation: {std: 1}}\n")
-    assert "prior.yoke_coolant_deviation is considered, so its prior is the `std` of the parameter" in said
     mean, cov = twin.model.prior_mean, twin.model.prior_cov
     written = tuning_yaml(twin.config, twin.estimator, twin.tuning, (mean, cov), whole=True)
     assert "winding: {mean" in written and "yoke_coolant_deviation" not in written
@@ -259,5 +257,3 @@ def test_offsets_and_scales_are_parameters_of_the_instruments():
 
 def test_an_offset_leaves_a_linear_model_to_the_kalman_filter():
     assert twin_of(MOTOR.replace("{std: 3}", "{std: 3, offset: {std: 0.5}}")).model.linear
-    scale = MOTOR.replace("{std: 3}", "{std: 3, scale: {std: 1 %}}")
-    assert "not linear once winding_scale_deviation are considered" in refusal(scale)
