@@ -465,8 +465,9 @@ class TwinSection(Section):
     tuning version has the range of its recordings. Default: the model's."""
     possible: dict[str, Limited] = {}
     """Physical limits of a state or an estimated parameter, in its unit, for example {level: {min: 0, max: 2.4}}. While
-    the band of its estimate lies beyond, health is suspect; a forecast ends there. Default: the model's; kelvins and
-    kilograms are at least 0, unless the prior's mean is within 2 standard deviations of it."""
+    the band of its estimate lies beyond, health is suspect; a forecast ends there. The prior's mean lies within, and so
+    does some of the range in `valid`. Default: the model's; kelvins and kilograms are at least 0, unless the prior's
+    mean is within 2 standard deviations of it."""
     withhold: dict[str, Positive] = {}
     """Half-width of the 95 % band of a state beyond which its estimate is withheld, in its unit, for example
     {soc: 0.2}: page, API and files then show the reason in place of a value. Default: never."""
