@@ -62,14 +62,8 @@ def known_stds(model: StateSpaceModel, cov: np.ndarray) -> dict[str, dict[str, f
     """Return for each estimated state its deviation if one considered parameter were measured exactly, smallest first.
 
     Conditioned on c_j the variance is P_ii - (P_xc)_ij² / C_jj, whatever the correlations of the parameters. The gain
-    is that of the past: a filter that had known c_j from the start may be better still.
-
-    Args:
-        model: A model with considered states.
-        cov: Covariance of its states (nx, nx), as of `Fold.moments`.
-
-    Returns:
-        Nothing for a model without considered states; of a state only those with a positive, finite variance.
+    is that of the past: a filter that had known c_j from the start may be better still. Arguments, and states without
+    a result, are those of `variance_shares`.
     """
     n = model.nx - model.considered
     if not _considers(model, cov):

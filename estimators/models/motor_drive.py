@@ -110,13 +110,11 @@ def network(u, p):
 
 
 @jit
-def rates(
-    T, current, eddy, iron_tooth, iron_yoke, iron_magnet, wt, ty, tm, wm, yc, wa, ma, cw, ct, cy, cm, coolant, ambient
+def balance(
+    T, copper, iron_tooth, iron_yoke, iron_magnet, wt, ty, tm, wm, yc, wa, ma, cw, ct, cy, cm, coolant, ambient
 ):
-    """Return dT/dt of the four nodes, K/s, at the temperatures T, °C; the other arguments are those of `network`."""
+    """Return dT/dt of the four nodes, K/s, at the temperatures T, °C; further arguments are those of `network`."""
     winding, tooth, yoke, magnet = T[WINDING], T[TOOTH], T[YOKE], T[MAGNET]
-    theta = 1.0 + COPPER * (winding - 20.0)
-    copper = current * theta + eddy / theta
     winding_tooth = (winding - tooth) * wt
     winding_magnet = (winding - magnet) * wm
     tooth_yoke = (tooth - yoke) * ty
@@ -130,20 +128,26 @@ def rates(
 
 
 @jit
-def tangent(winding, tooth, yoke, magnet, theta, constants):
-    """Return the derivative of `rates` in a direction (winding, tooth, yoke, magnet); theta as there."""
-    current, eddy, _, _, _, wt, ty, tm, wm, yc, wa, ma, cw, ct, cy, cm, _, _ = constants
-    copper = COPPER * (current - eddy / theta**2) * winding
-    winding_tooth = (winding - tooth) * wt
-    winding_magnet = (winding - magnet) * wm
-    tooth_yoke = (tooth - yoke) * ty
-    tooth_magnet = (tooth - magnet) * tm
-    return (
-        (copper - winding_tooth - winding_magnet - winding * wa) * cw,
-        (winding_tooth - tooth_yoke - tooth_magnet) * ct,
-        (tooth_yoke - yoke * yc) * cy,
-        (winding_magnet + tooth_magnet - magnet * ma) * cm,
-    )
+def rates(T, current, eddy, *rest):
+    """Return the `balance` at the temperatures T, °C; the other arguments are those of `network`."""
+    theta = 1.0 + COPPER * (T[WINDING] - 20.0)
+    return balance(T, current * theta + eddy / theta, *rest)
+
+
+DIRECTIONS = tuple(tuple(float(i == j) for i in range(4)) for j in range(4))
+
+
+@jit
+def tangent(v, theta, constants):
+    """Return the derivative of `rates` in the direction v; theta as there."""
+    copper = COPPER * (constants[0] - constants[1] / theta**2) * v[WINDING]
+    return balance(v, copper, 0.0, 0.0, 0.0, *constants[5:16], 0.0, 0.0)
+
+
+@jit
+def ahead(x, h, rate):
+    """Return x + h rate, of four each."""
+    return x[0] + h * rate[0], x[1] + h * rate[1], x[2] + h * rate[2], x[3] + h * rate[3]
 
 
 def F(x, u, p, dt, out):
@@ -151,26 +155,21 @@ def F(x, u, p, dt, out):
     k = network(u, p)
     h = 0.5 * dt
     a = rates(x, *k)
-    b = rates((x[0] + h * a[0], x[1] + h * a[1], x[2] + h * a[2], x[3] + h * a[3]), *k)
-    c = rates((x[0] + h * b[0], x[1] + h * b[1], x[2] + h * b[2], x[3] + h * b[3]), *k)
+    b = rates(ahead(x, h, a), *k)
+    c = rates(ahead(x, h, b), *k)
     theta_a = 1.0 + COPPER * (x[0] - 20.0)
     theta_b = theta_a + COPPER * h * a[0]
     theta_c = theta_a + COPPER * h * b[0]
     theta_d = theta_a + COPPER * dt * c[0]
     sixth = dt / 6.0
     for j in range(4):
-        v0 = 1.0 if j == WINDING else 0.0
-        v1 = 1.0 if j == TOOTH else 0.0
-        v2 = 1.0 if j == YOKE else 0.0
-        v3 = 1.0 if j == MAGNET else 0.0
-        a0, a1, a2, a3 = tangent(v0, v1, v2, v3, theta_a, k)
-        b0, b1, b2, b3 = tangent(v0 + h * a0, v1 + h * a1, v2 + h * a2, v3 + h * a3, theta_b, k)
-        c0, c1, c2, c3 = tangent(v0 + h * b0, v1 + h * b1, v2 + h * b2, v3 + h * b3, theta_c, k)
-        d0, d1, d2, d3 = tangent(v0 + dt * c0, v1 + dt * c1, v2 + dt * c2, v3 + dt * c3, theta_d, k)
-        out[0, j] = v0 + sixth * (a0 + 2.0 * b0 + 2.0 * c0 + d0)
-        out[1, j] = v1 + sixth * (a1 + 2.0 * b1 + 2.0 * c1 + d1)
-        out[2, j] = v2 + sixth * (a2 + 2.0 * b2 + 2.0 * c2 + d2)
-        out[3, j] = v3 + sixth * (a3 + 2.0 * b3 + 2.0 * c3 + d3)
+        v = DIRECTIONS[j]
+        k1 = tangent(v, theta_a, k)
+        k2 = tangent(ahead(v, h, k1), theta_b, k)
+        k3 = tangent(ahead(v, h, k2), theta_c, k)
+        k4 = tangent(ahead(v, dt, k3), theta_d, k)
+        for i in range(4):
+            out[i, j] = v[i] + sixth * (k1[i] + 2.0 * k2[i] + 2.0 * k3[i] + k4[i])
 
 
 def thermometer(name: str, node: int) -> Sensor:
