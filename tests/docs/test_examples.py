@@ -9,7 +9,7 @@ import pytest
 from scipy import stats
 
 from estimators import fold
-from estimators.log import READING, TRUTH
+from estimators.log import TRUTH
 from tests import ROOT
 
 EXAMPLES = ROOT / "docs" / "examples"
@@ -83,7 +83,7 @@ def test_a_recorded_log_is_fitted_and_smoothed():
     assert np.all(after < 1.02 * before) and after[model.state_names.index("magnet")] < 0.9 * before.max()
     # The fitted noise is what separates the thermocouples from the true temperatures.
     for k, sensor in enumerate(model.sensors):
-        mine = np.flatnonzero((events.kind == READING) & (events.channel == k))
+        mine = events.of_sensor(k)
         state = model.state_names.index(sensor.name)
         true = np.interp(events.t[mine], events.t[rows], values[:, state])
         error = events.value[mine, 0] - true

@@ -104,9 +104,9 @@ def test_inputs_parameters_rates_and_losses():
         b -= 0.5 * b * b
         u = 1.0 if 0.5 * (k + 1) >= 2.0 else 0.5
         expected.append((a + u, b))
-    kinds = (got.kind == READING) & (got.channel == 0)
+    kinds = got.of_sensor(0)
     np.testing.assert_allclose(got.value[kinds, :2], expected, rtol=1e-12, atol=1e-12)
-    once = (got.kind == READING) & (got.channel == 1)
+    once = got.of_sensor(1)
     assert got.t[once].tolist() == [1_500_000_000, 3_000_000_000, 4_500_000_000, 6_000_000_000]
     assert np.isnan(got.value[once, 0]).tolist() == [False, True, False, True]
     changes = got.t[(got.kind == INPUT) & (got.t > 0)]

@@ -12,7 +12,6 @@ from app.present.export.track_file import rows_of_run
 from app.twin.twin import load_twin
 from app.web.running import OpenedTwin
 from app.web.session import Page, Session
-from estimators.log import READING
 from tests.app.cli.test_check import ParsedHtml
 from tests.app.served import Client
 from tests.waiting import wait_for
@@ -42,8 +41,8 @@ def test_what_it_reads_is_said_beside_the_light_and_is_the_mean_of_its_last_inno
     state, text = session.engine.status().sensors["yoke"]
     taken = rows_of_run(session.engine)
     model, pull = session.engine.model, taken.pull
-    own = (pull.events.kind == READING) & (pull.events.channel == model.sensor_names.index("yoke"))
-    innovations = pull.track.innovation[own & np.isfinite(pull.track.innovation[:, 0]), 0][-200:]
+    innovations = pull.track.innovation[pull.events.of_sensor(model.sensor_names.index("yoke")), 0]
+    innovations = innovations[np.isfinite(innovations)][-200:]
     assert state == "held out" and text.startswith("yoke, held out: ")
     said = float(re.search(r": ([\d.]+) °C above the prediction of the other sensors", text)[1])
     assert said == pytest.approx(float(np.mean(innovations)), rel=0.06)  # two figures are said

@@ -11,7 +11,7 @@ from estimators.compiled.context import SLACK, steps_of
 from estimators.compiled.noise import add_noise, belief_root, has_correlated_rows, independent_rows, semidefinite_root
 from estimators.errors import ModelError
 from estimators.fold import Fold, fold
-from estimators.log import READING, TICK, Events, Log
+from estimators.log import TICK, Events, Log
 from estimators.model.parts import correlation_of, covariance_of
 from estimators.model.state_space import Noise, Row, Sensor, State, StateSpaceModel
 from estimators.tuning import Tuning
@@ -178,7 +178,7 @@ def test_the_simulator_draws_correlated_noise():
     events = read_all(
         Simulator(declared, seed=1, step=1.0, duration=4000.0, initial={"x": 0.0}, truth_noise={"x": 0.0})
     )
-    y = events.value[(events.kind == READING) & (events.channel == 1), :3]
+    y = events.value[events.of_sensor(1), :3]
     R = covariance_of(C, np.array([0.5, 2.0, 1e-3]))
     # A sample covariance of N draws has the standard deviation √((R_ii R_jj + R_ij²) / N).
     spread = np.sqrt((np.outer(np.diag(R), np.diag(R)) + R**2) / len(y))

@@ -187,16 +187,15 @@ def test_adaptation_recovers_a_wrong_q(estimator):
         assert 0.5 * spread < np.std(found) < 2.0 * spread
 
 
-@pytest.mark.parametrize(("tuned", "expected"), [(0.01, 0.1), (1000.0, 100.0)])
-def test_an_adapted_r_stays_within_its_bound(estimator, tuned, expected):
-    fold = folded(estimator, model(q=0.04, r=tuned), simulated(0, 0.04, 4.0), {"adapt": 1, "memory": 50})
-    np.testing.assert_allclose(fold._now.state[-1], expected, rtol=1e-14)
-
-
-@pytest.mark.parametrize(("tuned", "expected"), [(1e-4, 10.0), (1e3, 0.1)])
-def test_an_adapted_q_stays_within_its_bound(estimator, tuned, expected):
-    fold = folded(estimator, model(q=tuned, r=1.0), simulated(0, 1.0, 1.0), {"adapt": 2, "memory": 50})
-    np.testing.assert_allclose(fold._now.state[-1], expected, rtol=1e-14 if expected == 10.0 else 0.2)
+@pytest.mark.parametrize(
+    ("adapted", "tuned", "expected", "tolerance"),
+    [(1, 0.01, 0.1, 1e-14), (1, 1000.0, 100.0, 1e-14), (2, 1e-4, 10.0, 1e-14), (2, 1e3, 0.1, 0.2)],
+)
+def test_what_is_adapted_stays_within_its_bound(estimator, adapted, tuned, expected, tolerance):
+    true = {"q": 0.04, "r": 4.0} if adapted == 1 else {"q": 1.0, "r": 1.0}
+    own = model(**true | {" rq"[adapted]: tuned})
+    fold = folded(estimator, own, simulated(0, *true.values()), {"adapt": adapted, "memory": 50})
+    np.testing.assert_allclose(fold._now.state[-1], expected, rtol=tolerance)
 
 
 def test_only_readings_that_were_used_adapt(estimator):

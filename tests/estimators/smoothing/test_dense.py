@@ -43,23 +43,24 @@ def smoothed_by(estimator, model, tuning, log):
     return moments(smooth(fold), model.nx)
 
 
+def agree(found, expected):
+    for mine, exact, name in zip(found, expected, ("mean", "covariance"), strict=True):
+        close(mine, exact, name)
+
+
 @pytest.mark.parametrize("estimator", GAUSSIAN)
 @pytest.mark.parametrize(("nx", "nu", "seed"), CASES)
 def test_smoothed_moments(estimator, nx, nu, seed):
     matrices, log, joint = case(nx, nu, seed)
-    mean, cov = smoothed_by(estimator, matrices.model, Tuning.of(matrices.model), log)
-    expected_mean, expected_cov = joint.smoothed(np.ones(3, bool))
-    close(mean, expected_mean, "mean")
-    close(cov, expected_cov, "covariance")
+    found = smoothed_by(estimator, matrices.model, Tuning.of(matrices.model), log)
+    agree(found, joint.smoothed(np.ones(3, bool)))
 
 
 @pytest.mark.parametrize("estimator", GAUSSIAN)
 def test_a_sensor_held_out_says_nothing(estimator):
     matrices, log, joint = case(3, 2, 0)
-    mean, cov = smoothed_by(estimator, matrices.model, Tuning.of(matrices.model).set("use.second", False), log)
-    expected_mean, expected_cov = joint.smoothed(np.array([True, False, True]))
-    close(mean, expected_mean, "mean")
-    close(cov, expected_cov, "covariance")
+    found = smoothed_by(estimator, matrices.model, Tuning.of(matrices.model).set("use.second", False), log)
+    agree(found, joint.smoothed(np.array([True, False, True])))
 
 
 @pytest.mark.parametrize("estimator", [name for name in GAUSSIAN if ESTIMATORS[name].singular])
@@ -67,10 +68,8 @@ def test_states_that_are_certain_at_first(estimator):
     rng = np.random.default_rng(7)
     matrices = random_linear(rng, 3, 1, certain=True)
     log = random_log(rng, matrices, events=40)
-    mean, cov = smoothed_by(estimator, matrices.model, Tuning.of(matrices.model), log)
-    expected_mean, expected_cov = JointGaussian(matrices, log).smoothed(np.ones(3, bool))
-    close(mean, expected_mean, "mean")
-    close(cov, expected_cov, "covariance")
+    found = smoothed_by(estimator, matrices.model, Tuning.of(matrices.model), log)
+    agree(found, JointGaussian(matrices, log).smoothed(np.ones(3, bool)))
 
 
 # A body that moves at a speed which wanders: F and Q of two steps are those of one, so that queries between two
@@ -159,10 +158,7 @@ def test_queries_between_readings_and_steps_within(estimator):
         clock = t
         if kind == READING:
             chain.read(value)
-    mean, cov = smoothed_by(estimator, BODY, Tuning.of(BODY), log)
-    expected_mean, expected_cov = chain.solved()
-    close(mean, expected_mean[1:], "mean")
-    close(cov, expected_cov[1:], "covariance")
+    agree(smoothed_by(estimator, BODY, Tuning.of(BODY), log), [each[1:] for each in chain.solved()])
 
 
 @pytest.mark.parametrize("estimator", GAUSSIAN)
@@ -187,12 +183,11 @@ def test_a_reset_and_a_maintenance(estimator):
         if t == changed and log.t[i + 1] > log.t[i]:
             # The filter keeps the mean of what it no longer knows.
             chains[-1].go_on(np.diag([1.0, 0.0]), np.diag([0.0, START[1][1, 1]]), (0.0, fold.track.mean[i, 1]))
-    (first, first_cov), (second, second_cov) = (chain.solved() for chain in chains)
     # Of the two states at the maintenance the row shows the later; the first is the prior.
     at = int(np.flatnonzero(log.t[: log.n] == changed * SECOND)[-1]) + 1
-    mean, cov = moments(smooth_with_pairs(estimator, log), 2)
-    close(mean, np.vstack((np.delete(first, at, 0)[1:], second)), "mean")
-    close(cov, np.concatenate((np.delete(first_cov, at, 0)[1:], second_cov)), "covariance")
+    pairs = zip(*(chain.solved() for chain in chains), strict=True)
+    expected = [np.concatenate((np.delete(first, at, 0)[1:], second)) for first, second in pairs]
+    agree(moments(smooth_with_pairs(estimator, log), 2), expected)
 
 
 def smooth_with_pairs(estimator, log, tuning=None):
@@ -262,10 +257,7 @@ def test_a_twin_that_was_found_wrong(estimator):
         if log.kind[i] == READING and (i not in refused or decision.first <= i <= decision.row):
             chain.read(log.value[i, 0])
         clock = t
-    expected_mean, expected_cov = chain.solved()
-    mean, cov = moments(smooth(fold), 2)
-    close(mean, expected_mean[1:], "mean")
-    close(cov, expected_cov[1:], "covariance")
+    agree(moments(smooth(fold), 2), [each[1:] for each in chain.solved()])
 
 
 def test_a_filter_without_a_smoother_is_refused():

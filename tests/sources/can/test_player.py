@@ -114,9 +114,9 @@ def test_what_is_decoded_is_what_was_simulated(tmp_path):
     got = decoder.decode(decoder.gather(bus.frames, None))
     assert player.sent == len(bus.frames)
     for index, step in ((0, 0.01), (1, 0.01 / 3.6)):
-        theirs = expected.value[(expected.kind == READING) & (expected.channel == index), 0]
-        lost = np.isnan(expected.value[(expected.kind == READING) & (expected.channel == 0), 0])
-        ours = got.value[(got.kind == READING) & (got.channel == index), 0]
+        theirs = expected.value[expected.of_sensor(index), 0]
+        lost = np.isnan(expected.value[expected.of_sensor(0), 0])
+        ours = got.value[got.of_sensor(index), 0]
         assert lost.sum() == 12 and ours.size == theirs.size - lost.sum(), "a lost reading is a lost frame"
         np.testing.assert_allclose(ours, theirs[~lost], atol=step / 2 * 1.0001)
     truth = truth_of(got, 0)[1]

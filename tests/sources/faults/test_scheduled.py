@@ -29,7 +29,7 @@ def run(*faults: Fault, seed: int = 3):
 
 
 def spoken(events, sensor=0):
-    mine = (events.kind == READING) & (events.channel == sensor)
+    mine = events.of_sensor(sensor)
     return events.t[mine] * 1e-9, events.value[mine, 0]
 
 
@@ -78,7 +78,7 @@ def test_faults_of_one_row_leave_the_others():
         )
         for faults in ((), (Fault("bias", "gnss_position", size=7.0, row="north"),))
     )
-    fixes = (plain.kind == READING) & (plain.channel == 0)
+    fixes = plain.of_sensor(0)
     np.testing.assert_allclose((shifted.value - plain.value)[fixes][:, :2], [[0.0, 7.0]] * 5, atol=1e-12)
 
 

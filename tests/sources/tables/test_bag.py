@@ -72,7 +72,7 @@ def test_values_stamps_and_variances_are_read_exactly(tmp_path, way):
     ]
     events = read_all(table(files, channels, width=1))
     for index, at, values in ((0, t, x), (1, t, speed), (2, t + 1, elbow)):
-        mine = (events.kind == READING) & (events.channel == index)
+        mine = events.of_sensor(index)
         np.testing.assert_array_equal(events.t[mine], at)
         np.testing.assert_array_equal(events.value[mine, 0], values)
         np.testing.assert_array_equal(events.value[mine, 1], variance if index == 0 else np.full(300, np.nan))

@@ -52,12 +52,18 @@ def h(x, u, p, out):
     out[3] = np.nan if x[0] > 0.0 else x[0]
 
 
-def test_a_row_that_only_looks_like_a_state_at_the_prior_mean_is_not_one():
-    model = StateSpaceModel(
-        name="m", title="m", states=(State("a", "m"), State("b", "m")), noises=(Noise("a", "m²/s", 1.0),), f=unchanged,
-        sensors=(Sensor("s", tuple(Row(f"r{k}", "m", 1.0) for k in range(4)), h),),
+def model_of(states, rows, h, *, black_box=False):
+    """States and rows of one sensor, named by letters."""
+    return StateSpaceModel(
+        name="m", title="m", states=tuple(State(name, "m") for name in states), noises=(Noise("a", "m²/s", 1.0),),
+        f=identity_of_a_block if black_box else unchanged, black_box=black_box,
+        sensors=(Sensor("gauge", tuple(Row(name, "m", 1.0) for name in rows), h),),
     )  # fmt: skip
-    # At the mean, zero, a + b is a and b, with a slope of one; r2 has a scale and a lever like a real sensor.
+
+
+def test_a_row_that_only_looks_like_a_state_at_the_prior_mean_is_not_one():
+    model = model_of("ab", "klmn", h)
+    # At the mean, zero, a + b is a and b, with a slope of one; m has a scale and a lever like a real sensor.
     assert [(dot.row, dot.state) for dot in observed(model)] == [(0, 1), (2, 1)]
 
 
@@ -75,20 +81,13 @@ def raises_beyond_the_mean(x, u, p, out):
 
 
 def test_a_black_box_is_asked_for_blocks():
-    model = StateSpaceModel(
-        name="m", title="m", states=(State("a", "m"), State("b", "m")), noises=(Noise("a", "m²/s", 1.0),),
-        f=identity_of_a_block, sensors=(Sensor("s", (Row("a", "m", 1.0),), first_of_a_block),), black_box=True,
-    )  # fmt: skip
+    model = model_of("ab", "a", first_of_a_block, black_box=True)
     assert [(item.sensor, item.row, item.state) for item in observed(model)] == [(0, 0, 0)]
 
 
 def test_a_sensor_that_raises_near_the_prior_has_no_dots(capsys):
     """Machine code gives NaN there, and the twin runs."""
-    model = StateSpaceModel(
-        name="m", title="m", states=(State("a", "m"),), noises=(Noise("a", "m²/s", 1.0),), f=unchanged,
-        sensors=(Sensor("s", (Row("a", "m", 1.0), Row("b", "m", 1.0)), raises_beyond_the_mean),),
-    )  # fmt: skip
-    assert observed(model) == []
+    assert observed(model_of("a", "ab", raises_beyond_the_mean)) == []
     assert capsys.readouterr().err == ""
 
 
@@ -97,11 +96,7 @@ def test_a_sensor_that_fails_otherwise_is_named_once(black_box, capsys):
     def h(x, u, p, out=None):
         raise LookupError(f"no table of {black_box}")
 
-    model = StateSpaceModel(
-        name="m", title="m", states=(State("a", "m"),), noises=(Noise("a", "m²/s", 1.0),),
-        f=identity_of_a_block if black_box else unchanged, sensors=(Sensor("gauge", (Row("a", "m", 1.0),), h),),
-        black_box=black_box,
-    )  # fmt: skip
+    model = model_of("a", "a", h, black_box=black_box)
     assert observed(model) == observed(model) == []
     (line,) = capsys.readouterr().err.splitlines()
     assert all(part in line for part in ("model m", "h of gauge", f"LookupError: no table of {black_box}"))

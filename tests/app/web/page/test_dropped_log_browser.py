@@ -13,7 +13,6 @@ import can
 import numpy as np
 import pytest
 
-from estimators.log import READING
 from estimators.track import HELD_OUT, USED
 from tests.app.scripted import pull_all
 from tests.app.web.gallery.opened import opened
@@ -110,7 +109,7 @@ def drafted(page, session, name):
 def rows_of(pull, model, sensor):
     """Return values, means of the first state and verdicts at the measurements of a sensor."""
     index = [item.name for item in model.sensors].index(sensor)
-    at = np.flatnonzero((pull.events.kind == READING) & (pull.events.channel == index))
+    at = pull.events.of_sensor(index)
     return pull.events.value[at, 0], pull.track.mean[at], pull.track.verdict[at]
 
 
