@@ -21,6 +21,7 @@ REASONS = ("range", "rate", "stuck", "saturated", "duplicate")
 itself; saturated converter; a measurement that arrived before. Bits of `Track.screened`, in this order."""
 
 RANGE, RATE, REPEATED, SATURATED, DUPLICATE = (1 << k for k in range(len(REASONS)))
+NO_VALUE = RANGE | RATE  # Reasons for which a row tells nothing of its sensor, not even that its value has changed
 
 HEALTH_NAMES = ("waiting", "tracking", "advisory", "suspect", "degraded", "diverged", "stale")
 WAITING, TRACKING, ADVISORY, SUSPECT, DEGRADED, DIVERGED, STALE = range(len(HEALTH_NAMES))

@@ -6,7 +6,7 @@ import numpy as np
 
 from ..compiled.context import prior, sensor_rows, sensor_variances, shown_states
 from ..log import INPUT, READING, RESET
-from ..numerics.jit import borrowed, embedded, floats, inlined, ints, part
+from ..numerics.jit import borrowed, embedded, floats, ints, part
 from ..track import (
     ADVISORY,
     DEGRADED,
@@ -14,6 +14,7 @@ from ..track import (
     DUPLICATE,
     FAILED,
     GATED,
+    NO_VALUE,
     SCREENED,
     STALE,
     SUSPECT,
@@ -84,20 +85,11 @@ POOR_MEASUREMENTS = 60
 number between two counts of ancestors: by chance one count may be 1, hardly three in succession."""
 
 
-@inlined
-def _is_copy(i, track):
-    """Return whether a measurement is a copy, as gateways make them: it is no evidence."""
-    for k in range(track.screened.shape[1]):
-        if track.screened[i, k] & DUPLICATE != 0:
-            return True
-    return False
-
-
 @embedded
-def _has_value(y, count):
-    """Return whether a measurement has a value in any row."""
+def _has_news(i, y, count, track):
+    """Return whether a measurement has a value in any row; a copy, as gateways make them, is no evidence."""
     for k in range(count):
-        if np.isfinite(y[k]):
+        if np.isfinite(y[k]) and track.screened[i, k] & DUPLICATE == 0:
             return True
     return False
 
@@ -139,8 +131,9 @@ def _test(i, now, y, s, context, policy, state, track):
             r = y[width + k]
         innovation, std = track.innovation[i, k], track.innovation_std[i, k]
         begins = resetting(each, std)
-        mask = before & ~STUCK | repeat(each, y[k], r, h, base, before, innovation, std, verdict == USED)
-        screened = track.screened[i, k] != 0
+        screened, mask = track.screened[i, k] != 0, before
+        if track.screened[i, k] & NO_VALUE == 0:
+            mask = before & ~STUCK | repeat(each, y[k], r, h, base, before, innovation, std, verdict == USED)
         if (judged or verdict == FAILED or screened) and not begins:
             ratio = chances[1] if verdict == USED and not screened else chances[0]
             level = add(each, AT_REFUSALS, ratio, h, base[3 + AT_REFUSALS])
@@ -158,7 +151,6 @@ def _test(i, now, y, s, context, policy, state, track):
         each[MASK] = mask
         graded, graded_before = grade(each, mask, context.gated, r, base), each[GRADE]
         each[GRADE] = graded
-        track.alarms[i, k] = mask | ADVISORY_ALARM if graded == ADVISED else mask
         state[SUSPECT_ROWS] += (graded == ACTED_ON) - (graded_before == ACTED_ON)
         state[ADVISED_ROWS] += (graded == ADVISED) - (graded_before == ADVISED)
         state[LOST_ROWS] += (mask & LOST != 0) - (before & LOST != 0)
@@ -247,13 +239,17 @@ def watch_row(i, t, kind, channel, value, context, policy, state, track):
         track.alarms[i, k] = 0
     if kind[i] == READING:
         y = floats(value[i:].ctypes.data, value.shape[1])
+        first, count = sensor_rows(context, channel[i])
         # A sensor that reports no value has dropped out all the same.
-        if _has_value(y, sensor_rows(context, channel[i])[1]):
+        if _has_news(i, y, count, track):
             if track.verdict[i] != SCREENED:
                 state[HEARD] = 1.0
                 state[UNSETTLED] = max(state[UNSETTLED] - 1.0, 0.0)
-            if not _is_copy(i, track):
-                _test(i, now, y, channel[i], context, policy, state, track)
+            _test(i, now, y, channel[i], context, policy, state, track)
+        # Neither a missing value nor a copy ends an alarm.
+        for k in range(count):
+            own = row_part(state, sensors, first + k)
+            track.alarms[i, k] = int(own[MASK]) | (ADVISORY_ALARM if own[GRADE] == ADVISED else 0)
         if np.isfinite(track.effective[i]):
             _count_particles(i, context, state, track)
     elif kind[i] == INPUT:

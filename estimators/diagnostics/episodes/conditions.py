@@ -53,7 +53,7 @@ def dropouts(judged: JudgedRows) -> Iterator[FoundEpisode]:
     for s in range(last_sensor):
         if model.sensors[s].by_chance:
             continue  # it may share its bit with one that dropped out
-        heard = events.of_sensor(s)
+        heard = judged.measured(s)
         earlier = 0 if judged.last_heard is None else int(judged.last_heard[s])
         for run in runs(flags >> s & 1 != 0 if s < own_bits else shared & _in_gap(t, heard)):
             before = heard[heard < run.begin]
@@ -154,24 +154,29 @@ def impoverished_particles(judged: JudgedRows) -> Iterator[FoundEpisode]:
 
 def contradicting_sensors(judged: JudgedRows, end: int) -> tuple[str, ...]:
     """Return the used sensors whose last measurement before row `end` was rejected, shifted or repeated."""
-    events, track = judged.events.select(slice(0, end)), judged.track
-    off = []
+    track, off = judged.track, []
     for s, sensor in enumerate(judged.model.sensors):
-        rows = events.of_sensor(s)
+        rows = judged.measured(s)
+        rows = rows[rows < end]
         if not rows.size or not judged.tuning.used[s]:
             continue
         last = rows[-1]
-        alarms = int(np.bitwise_or.reduce(track.alarms[last, : len(sensor.rows)]))
-        if track.verdict[last] in (GATED, SCREENED) or alarms & CONTRADICTING:
+        if track.verdict[last] in (GATED, SCREENED) or np.any(track.alarms[last] & CONTRADICTING):
             off.append(sensor.name)
     return tuple(off)
 
 
 def lost_estimates(judged: JudgedRows) -> Iterator[FoundEpisode]:
     """Yield the times in which the twin is stale or has diverged."""
+    t, track, sensors = judged.events.t, judged.track, len(judged.model.sensors)
     for code in (STALE, DIVERGED):
-        for run in runs(judged.track.health == code):
-            yield _lost(judged, code, run)
+        for run in runs(track.health == code):
+            start = run.start(t) - (float(track.age[run.begin]) if code == STALE else 0.0)
+            size = float(t[run.end - 1]) * 1e-9 - start
+            off = contradicting_sensors(judged, run.end) if code == DIVERGED else ()
+            cause = HEALTH_NAMES[code]
+            facts = TwinFacts(name="twin", cause=cause, start=start, size=size, off=off, sensors=sensors)
+            yield _found(cause, facts, run.over(t), np.nan, np.nan, run, t)
 
 
 def silent_gaps(judged: JudgedRows) -> Iterator[FoundEpisode]:
@@ -183,13 +188,3 @@ def silent_gaps(judged: JudgedRows) -> Iterator[FoundEpisode]:
         start, end = float(t[k]) * 1e-9 - float(track.age[k]), float(t[k + 1]) * 1e-9
         facts = TwinFacts(name="twin", cause=HEALTH_NAMES[STALE], start=start, size=end - start)
         yield _found("gap", facts, end, np.nan, np.nan, AlarmRun(k + 1, k + 2, False), t)
-
-
-def _lost(judged: JudgedRows, code: int, run: AlarmRun) -> FoundEpisode:
-    t, cause = judged.events.t, HEALTH_NAMES[code]
-    start = run.start(t) - (float(judged.track.age[run.begin]) if code == STALE else 0.0)
-    size = float(t[run.end - 1]) * 1e-9 - start
-    off = contradicting_sensors(judged, run.end) if code == DIVERGED else ()
-    facts = TwinFacts(name="twin", cause=cause, start=start, size=size, off=off, sensors=len(judged.model.sensors))
-    found = _found("twin", facts, run.over(t), np.nan, np.nan, run, t)
-    return found._replace(key=("twin", cause))

@@ -9,7 +9,7 @@ import numpy as np
 
 from ...log import Events
 from ...model.state_space import StateSpaceModel
-from ...track import GATED, USED, Track
+from ...track import GATED, MISSING, USED, Track
 from ...tuning import Tuning
 
 JOINED = 100  # Rows without an alarm after which the next alarm begins another episode
@@ -72,6 +72,11 @@ class JudgedRows(NamedTuple):
     last_heard: np.ndarray | None = None
     alarmed: np.ndarray | None = None
     stale_after: float = np.inf
+
+    def measured(self, s: int) -> np.ndarray:
+        """Return the rows in which sensor s has a value: others tell nothing of it."""
+        rows = self.events.of_sensor(s)
+        return rows[self.track.verdict[rows] != MISSING]
 
 
 class AlarmRun(NamedTuple):

@@ -9,7 +9,7 @@ import numpy as np
 
 from ...gate.isolation import maintained
 from ...log import RESET
-from ...track import GATED, REASONS, SCREENED, USED
+from ...track import GATED, NO_VALUE, REASONS, SCREENED, USED
 from ..detectors import (
     ADVISORY_ALARM,
     AGREEING,
@@ -39,7 +39,8 @@ REMAINING_NATS = 2.0  # log Λ below which no effect remains: that of a size at 
 LOSS_SHARE = 0.5  # Share of rejected or repeated measurements of an episode from which it is a loss of the sensor
 ALARMS_OF = {kind: detector_of(kind).bits for kind in KINDS}  # Alarms by the effect that they show
 LOSSES = tuple(detector.name for detector in DETECTORS if detector.sensor_lost)  # Causes of which a sensor is lost
-OF_ALL_ROWS = ("disagreeing", "agreeing")  # Causes of a sensor as a whole, not of one of its rows
+OF_ALL_ROWS = {"disagreeing": "narrow", "agreeing": "wide"}
+"""Causes of a sensor as a whole, not of one of its rows, and the effects that they are."""
 
 UNKNOWN_EFFECTS = tuple(detector for detector in DETECTORS if detector.alarms and not detector.effect)
 """Detectors whose alarms have episodes of their own, sized by their own tests."""
@@ -74,7 +75,7 @@ def sensor_alarms(judged: JudgedRows) -> Iterator[FoundEpisode]:
     if not track.alarms.any():
         return
     for s, sensor in enumerate(model.sensors):
-        rows = events.of_sensor(s)
+        rows = judged.measured(s)
         alarms = track.alarms[rows, : len(sensor.rows)]
         masks = alarms & KNOWN_EFFECTS
         found = [
@@ -154,7 +155,7 @@ def _episode(judged: JudgedRows, s: int, rows: np.ndarray, run: AlarmRun, shown:
         text = f"{text}; maintenance has changed the asset, so the twin is wrong rather than the sensor"
     if run.lasts and over < rows.size and (back or run.end < rows.size):
         text = f"{text}; {return_text(cause, events.t[rows[over]] * 1e-9)}"
-    alarms = track.alarms[rows[run.begin : run.end], : len(model.sensors[s].rows)]
+    alarms = track.alarms[rows[run.begin : run.end]]
     alarms = alarms[alarms.any(axis=1)]
     valid = not detector.sensor_lost and np.mean(((alarms == 0) | (alarms & ADVISORY_ALARM != 0)).all(axis=1)) > 0.5
     return Episode(
@@ -193,7 +194,8 @@ def _lost(judged: JudgedRows, s: int, rows: np.ndarray, masks: np.ndarray, run: 
         k = int(np.argmax((judged.track.screened[rows[begin:end]] != 0).sum(axis=0)))
         return _share(k, verdict, SCREENED, _after_last(verdict[:begin] != SCREENED), run, cause="screened")
     for row in np.flatnonzero(said & STUCK):
-        stuck = _stuck(judged.events.value[rows, row], masks[:, row], int(row), run)
+        values = np.where(judged.track.screened[rows, row] & NO_VALUE, np.nan, judged.events.value[rows, row])
+        stuck = _stuck(values, masks[:, row], int(row), run)
         if stuck is not None:
             return stuck
     # Other tests clear more slowly than that of rejections. A gate that rejects only some measurements has a reason
@@ -245,13 +247,12 @@ def _best_effect(
         if known.size < 2:
             continue
         e = without_baseline(judged, s, int(k), e[known])
-        alarm = min(int(np.searchsorted(known, run.begin - first)), e.size - 1)
         kinds = _kinds(judged, s, int(k), masks[run.begin : run.end, k])
         for cause in kinds:
-            begun, over = _likeliest(e, alarm, cause)
-            ranked = effects(e[begun : min(over, begun + MAX_MEASUREMENTS)])
+            own, over, ends = _likeliest(e, known, first, run, cause)
+            ranked = effects(e[own])
             ranked.sort(key=lambda item: item.cause not in kinds)
-            found = int(k), first + int(known[begun]), first + int(known[over - 1]) + 1, ranked, e[over:]
+            found = int(k), *ends, ranked, e[over:]
             if ranked[0].cause != cause:
                 other = found if ranked[0].ratio > other[3][0].ratio else other
                 continue
@@ -299,14 +300,18 @@ def _kinds(judged: JudgedRows, s: int, k: int, masks: np.ndarray) -> list[str]:
 def _joint_effect(judged: JudgedRows, rows: np.ndarray, masks: np.ndarray, run: AlarmRun, cause: str) -> RunEffect:
     """Return the common scale of all rows of a sensor, from √(NIS / degrees of freedom) in place of e."""
     first = _earliest(judged, rows, masks, run)
-    nis, dof = judged.track.nis[rows[first : run.end]], judged.track.dof[rows[first : run.end]]
-    known = np.flatnonzero(np.isfinite(nis) & (dof > 0))
-    e = np.sqrt(nis[known] / dof[known])
-    alarm = min(int(np.searchsorted(known, run.begin - first)), e.size - 1)
-    begun, over = _likeliest(e, alarm, "narrow" if cause == "disagreeing" else "wide")
-    looked_at = slice(begun, min(over, begun + MAX_MEASUREMENTS))
-    _, size, low, high, _ = common_scale(e[looked_at], dof[known][looked_at])
-    return RunEffect(0, first + int(known[begun]), first + int(known[over - 1]) + 1, cause, size, low, high)
+    e = joint_scale(judged, rows[first : run.end])
+    known = np.flatnonzero(np.isfinite(e))
+    e, dof = e[known], judged.track.dof[rows[first + known]]
+    own, _, ends = _likeliest(e, known, first, run, OF_ALL_ROWS[cause])
+    _, size, low, high, _ = common_scale(e[own], dof[own])
+    return RunEffect(0, *ends, cause, size, low, high)
+
+
+def joint_scale(judged: JudgedRows, rows: np.ndarray) -> np.ndarray:
+    """Return √(NIS / degrees of freedom) of the measurements at `rows`; NaN where there is none."""
+    nis, dof = judged.track.nis[rows], judged.track.dof[rows]
+    return np.sqrt(np.where(dof > 0, nis, np.nan) / np.maximum(dof, 1))
 
 
 def _own_evidence(
@@ -319,12 +324,11 @@ def _own_evidence(
         known, ratios = evidence(judged, s, rows[first : run.end], int(k), detector)
         if not known.size:
             continue
-        alarm = min(int(np.searchsorted(known, run.begin - first)), known.size - 1)
-        begun, over = _likeliest(ratios, alarm, EVIDENCE)
-        own = ratios[begun : min(over, begun + MAX_MEASUREMENTS)]
+        part, _, ends = _likeliest(ratios, known, first, run, EVIDENCE)
+        own = ratios[part]
         if np.isnan(best.size) or own.mean() > best.size:
             half = 1.96 * float(own.std()) / np.sqrt(own.size)
-            size, ends = float(own.mean()), (first + int(known[begun]), first + int(known[over - 1]) + 1)
+            size = float(own.mean())
             best = RunEffect(int(k), *ends, detector.name, size, size - half, size + half)
     return best
 
@@ -345,14 +349,21 @@ def _earliest(judged: JudgedRows, rows: np.ndarray, masks: np.ndarray, run: Alar
     return int(np.searchsorted(rows, rows[first] + resets[-1])) if resets.size else first
 
 
-def _likeliest(e: np.ndarray, alarm: int, cause: str) -> tuple[int, int]:
-    """Return the most likely begin and end, in e (n,), of an effect that is present at `alarm`.
+def _likeliest(
+    e: np.ndarray, known: np.ndarray, first: int, run: AlarmRun, cause: str
+) -> tuple[slice, int, tuple[int, int]]:
+    """Return where an effect in a run of alarms most likely is: in e (n,), of the measurements `first` + `known`.
 
     A test clears later than its cause ends, so the end is estimated like the onset, backwards.
+
+    Returns:
+        The part of e that is looked at, the end in e, and the measurements of begin and end.
     """
+    alarm = min(int(np.searchsorted(known, run.begin - first)), e.size - 1)
     begun = onset(e[: alarm + 1], cause)
-    run = e[begun:]
-    return begun, max(begun + run.size - onset(run[::-1], cause), min(alarm + 1, begun + run.size))
+    over = max(e.size - onset(e[begun:][::-1], cause), alarm + 1)
+    ends = first + int(known[begun]), first + int(known[over - 1]) + 1
+    return slice(begun, min(over, begun + MAX_MEASUREMENTS)), over, ends
 
 
 def _after_last(there: np.ndarray) -> int:

@@ -15,13 +15,13 @@ import numpy as np
 from ...fold import Fold
 from ...log import READING, Events
 from ...model.state_space import StateSpaceModel
-from ...track import GATED, SCREENED, Track
+from ...track import GATED, MISSING, SCREENED, Track
 from ...tuning import Tuning
 from ..detectors import detector_of
 from ..effects import EVIDENCE, MAX_SIGMA, NO_SUMS, Sums, gains
 from .conditions import dropouts, impoverished_particles, left_ranges, lost_estimates, silent_gaps
 from .episode import JOINED, Episode, FoundEpisode, JudgedRows, standardised, without_baseline
-from .sensors import ALARM_KEYS, LOSSES, OF_ALL_ROWS, UNKNOWN_EFFECTS, evidence, sensor_alarms
+from .sensors import ALARM_KEYS, LOSSES, OF_ALL_ROWS, UNKNOWN_EFFECTS, evidence, joint_scale, sensor_alarms
 
 MAX_ROWS = 16_384  # Rows kept at most; at least half of them once there were as many
 MAX_BYTES = 16 * 2**20  # Memory of the kept rows; rows of a large field are fewer
@@ -82,7 +82,7 @@ class DroppedRows(NamedTuple):
         """Return the summary after further rows; `at`: time of the first alarm, ns."""
         events = judged.events
         s = judged.model.sensor_names.index(key[1])
-        rows = events.of_sensor(s)
+        rows = judged.measured(s)
         rows = rows[events.t[rows] * 1e-9 >= episode.start]
         alarms = np.flatnonzero((judged.track.alarms[rows] & ALARM_KEYS[key[0]] != 0).any(axis=1))
         quiet = rows.size - 1 - int(alarms[-1]) if alarms.size else self.quiet + int(np.sum(events.t[rows] > at))
@@ -103,9 +103,7 @@ def _effect_series(judged: JudgedRows, s: int, rows: np.ndarray, episode: Episod
     """
     track, cause = judged.track, episode.cause
     if cause in OF_ALL_ROWS:
-        nis, dof = track.nis[rows], track.dof[rows]
-        e = np.sqrt(np.where(dof > 0, nis, np.nan) / np.maximum(dof, 1))
-        return e, "narrow" if cause == "disagreeing" else "wide"
+        return joint_scale(judged, rows), OF_ALL_ROWS[cause]
     k = judged.model.row_names.index(episode.subject) - judged.model.row_start[s]
     if cause in LOSSES:
         equal = judged.events.value[rows, k] == episode.size
@@ -292,9 +290,9 @@ class EpisodeTracker:
             kept += [self._carried[entry.key]] if entry.key in self._carried else []
             self._carried[entry.key] = entry.after(dropped)
         self._closed = kept if self._max_closed is None else kept[-self._max_closed :]
-        reading = dropped.events.kind == READING
+        heard = (dropped.events.kind == READING) & (dropped.track.verdict != MISSING)
         # Times ascend: the last of equal indices stays.
-        self._last_heard[dropped.events.channel[reading]] = dropped.events.t[reading]
+        self._last_heard[dropped.events.channel[heard]] = dropped.events.t[heard]
         for column in self._columns:
             column[: self.n - count] = column[count : self.n].copy()
         self.first, self.n = self.first + count, self.n - count

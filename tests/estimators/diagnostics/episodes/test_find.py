@@ -8,11 +8,12 @@ import numpy as np
 import pytest
 
 from estimators.diagnostics.detector_state import no_baseline
-from estimators.diagnostics.detectors import BITS, CAUSES, IMPOVERISHED, NARROW, SHIFTED_DOWN, SHIFTED_UP, SPIKY, STUCK
+from estimators.diagnostics.detectors import BITS, CAUSES, IMPOVERISHED, NARROW, SHIFTED, SPIKY, STUCK
 from estimators.diagnostics.episodes import JOINED, Episode, episode_json, episodes, found_in, judged_rows
 from estimators.diagnostics.episodes.wording import SensorFacts
 from estimators.diagnostics.health import HealthPolicy
 from estimators.log import READING, RESET, Events, Log
+from estimators.model.parts import Limits
 from estimators.model.state_space import Input, Noise, State
 from estimators.track import DIVERGED, GATED, TRACKING, USED, WAITING
 from estimators.tuning import Tuning
@@ -35,6 +36,7 @@ MODEL = level_model(
     f=walk,
     linear=True,
 )
+LIMITED = replace(MODEL, sensors=(replace(MODEL.sensors[0], limits=Limits(range=((-100.0, 100.0),))), MODEL.sensors[1]))
 POLICY = HealthPolicy(degraded_after=10.0, stale_after=40.0)
 N, BEGIN, END = 1200, 400, 600
 
@@ -269,8 +271,7 @@ def alarmed(*readings):
     """Alarms of the gauge at those of its readings, in a fold that is in order."""
     judged = judged_rows(folded())
     track = judged.track.copy()
-    rows = np.flatnonzero((judged.events.kind == READING) & (judged.events.channel == 0))
-    track.alarms[rows[list(readings)], 0] = NARROW
+    track.alarms[judged.events.of_sensor(0)[list(readings)], 0] = NARROW
     return found_in(judged._replace(track=track))
 
 
@@ -297,8 +298,8 @@ def test_episodes_come_in_the_order_of_their_start():
 def test_episodes_of_several_bits_are_one():
     judged = judged_rows(folded())
     track = judged.track.copy()
-    rows = np.flatnonzero((judged.events.kind == READING) & (judged.events.channel == 1))
-    track.alarms[rows[100:120], 0], track.alarms[rows[110:130], 3] = NARROW, SHIFTED_DOWN
+    rows = judged.events.of_sensor(1)
+    track.alarms[rows[100:120], 0], track.alarms[rows[110:130], 3] = NARROW, SHIFTED
     assert len(found_in(judged._replace(track=track))) == 1
 
 
@@ -311,8 +312,7 @@ def test_a_noisy_sensor_that_rests_for_a_while_is_not_stuck():
         return y
 
     fold = folded(gauge=change)
-    rows = np.flatnonzero((fold.log.kind[: fold.n] == READING) & (fold.log.channel[: fold.n] == 0))
-    assert not np.any(fold.track.alarms[rows, 0] & STUCK)
+    assert not np.any(fold.track.alarms[fold.log.events.of_sensor(0), 0] & STUCK)
     assert [each.cause for each in episodes(fold) if each.subject == "gauge"] == ["narrow"]
 
 
@@ -320,12 +320,12 @@ def test_what_was_normal_is_no_cause_unless_its_test_spoke():
     """Spikes of 6 σ, one reading in 15, as always; from BEGIN on 1 σ more."""
     judged = judged_rows(folded())
     track, rng = judged.track.copy(), np.random.default_rng(1)
-    rows = np.flatnonzero((judged.events.kind == READING) & (judged.events.channel == 0))
+    rows = judged.events.of_sensor(0)
     e = rng.standard_normal(N)
     e[::15] = 6.0 * rng.choice([-1.0, 1.0], e[::15].shape)
     e[BEGIN:END] += 1.0
     track.innovation[rows, 0] = e * track.innovation_std[rows, 0]
-    track.alarms[rows[BEGIN + 20 : END], 0] = SHIFTED_UP
+    track.alarms[rows[BEGIN + 20 : END], 0] = SHIFTED
     baseline = no_baseline(MODEL)
     baseline[0, 3:][BITS & (SPIKY | NARROW) != 0] = 1e4
     for normal, cause in ((None, "spiky"), (baseline, "shifted")):
@@ -356,16 +356,20 @@ def cut(until, **faults):
     return judged._replace(events=judged.events.select(slice(0, n)), track=judged.track.select(slice(0, n)))
 
 
+def of_gauge(judged):
+    return [item.episode for item in found_in(judged) if item.key == ("sensor", "gauge")]
+
+
 def test_what_is_back_to_normal_is_said_while_the_slowest_test_still_falls():
     """After a shift of 5 σ that of 0.2 σ falls for hundreds of readings; its end shows in a few."""
     fault = {"gauge": lambda x, z, rng: x + 0.2 * z + 1.5}
     for until in (*range(BEGIN + 20, END, 20), END):
-        (each,) = [item.episode for item in found_in(cut(until, **fault)) if item.key == ("sensor", "gauge")]
+        (each,) = of_gauge(cut(until, **fault))
         assert each.end is None and "back to normal" not in each.text, until
     judged = cut(END + 15, **fault)
-    gauge = np.flatnonzero((judged.events.kind == READING) & (judged.events.channel == 0))
+    gauge = judged.events.of_sensor(0)
     assert judged.track.alarms[gauge[-1], 0] != 0
-    (each,) = [item.episode for item in found_in(judged) if item.key == ("sensor", "gauge")]
+    (each,) = of_gauge(judged)
     since = float(re.search(r"; back to normal since ([\d.]+) s: the alarm clears", each.text)[1])
     # The filter has followed by 4 of the 5 σ, so that the last readings of the fault look much like those after it.
     assert each.end is None and abs(since - END) <= 15
@@ -395,18 +399,33 @@ def test_a_reset_is_advised_only_when_no_sensor_is_off():
     assert text((USED, USED)).endswith("reset the twin to its prior, then check the sensor that was in alarm first")
 
 
-def test_gaps_of_a_stuck_sensor_are_no_movement():
-    def stuck(gaps):
-        def change(x, z, rng):
-            values = np.full_like(x, 0.125)
-            values[9::gaps] = np.nan
-            return values
+@pytest.mark.parametrize(("cause", "factor"), [*((cause, np.nan) for cause in SENSORS), ("stuck", 1e9)])
+def test_a_row_without_a_possible_value_tells_nothing(cause, factor):
+    """Episodes are as if it were not there: each tenth in the fault, and without a value all that end it."""
+    fold = folded(**SENSORS[cause][0])
+    events, t = fold.log.events, fold.log.events.t // SECOND
+    rows = (events.kind == READING) & (events.channel == MODEL.sensor_names.index(SENSORS[cause][1][0])) & (t > BEGIN)
+    tenth, ending = rows & (t % 10 == 5), rows & (t > END - 40)
+    faulty = events.copy()
+    faulty.value[tenth] *= factor
+    faulty.value[ending] = np.nan
+    found, expected = (
+        episodes(advanced("kf", LIMITED, as_log(each), replace(fold.tuning, model=LIMITED), policy=POLICY))
+        for each in (faulty, events.select(~tenth & ~ending))
+    )
+    assert [repr(each) for each in found] == [repr(each) for each in expected]
+    assert {(each.cause, each.end) for each in found} >= {(cause, None), ("silent", None)}
 
-        return only(episodes(folded(gauge=change)), "stuck")
 
-    whole, with_gaps = stuck(N), stuck(10)
-    assert (with_gaps.start, with_gaps.end, with_gaps.size) == (whole.start, whole.end, whole.size)
-    assert whole.start == BEGIN + 1
+def test_a_row_without_a_value_is_stuck_while_others_of_its_sensor_have_values():
+    def chain(x, z, rng):
+        y = x + z
+        y[:, 3], y[150:, 3] = x[0], np.nan
+        return y
+
+    before, after = (found_in(cut(end, chain=chain)) for end in (BEGIN + 150, END))
+    assert [(each.episode.cause, each.episode.text) for each in after] == [("stuck", before[0].episode.text)]
+    assert before[0].episode.text.startswith("chain.c3 is stuck")
 
 
 def test_a_stuck_sensor_that_moves_again_is_over_whatever_other_alarms_follow():
@@ -415,9 +434,9 @@ def test_a_stuck_sensor_that_moves_again_is_over_whatever_other_alarms_follow():
     def gauge(x, z, rng):
         return np.where(np.arange(END - BEGIN)[:, None] < 100, x[0] + 1.5, x + 2.0 * z)
 
-    (each,) = [item.episode for item in found_in(cut(BEGIN + 90, gauge=gauge)) if item.key == ("sensor", "gauge")]
+    (each,) = of_gauge(cut(BEGIN + 90, gauge=gauge))
     assert (each.cause, each.end, each.grade) == ("stuck", None, "degraded")
-    found = [item.episode for item in found_in(cut(BEGIN + 250, gauge=gauge)) if item.key == ("sensor", "gauge")]
+    found = of_gauge(cut(BEGIN + 250, gauge=gauge))
     assert [(item.cause, item.end and round(item.end, 6), item.grade) for item in found] == [
         ("stuck", BEGIN + 100.0, "degraded"),
         ("narrow", None, "suspect"),

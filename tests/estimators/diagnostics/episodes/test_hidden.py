@@ -1,19 +1,15 @@
 """What lasts of a sensor hides no later cause that asks for more: that one has an episode of its own."""
 
-from dataclasses import replace
-
 import numpy as np
 import pytest
 
 from estimators.diagnostics.episodes import found_in, judged_rows
 from estimators.log import Log
-from estimators.model.parts import Limits
 from estimators.tuning import Tuning
 from tests.support import folded
 
-from .test_find import MODEL, POLICY
+from .test_find import LIMITED, POLICY
 
-LIMITED = replace(MODEL, sensors=(replace(MODEL.sensors[0], limits=Limits(range=((-100.0, 100.0),))), MODEL.sensors[1]))
 N, BEGIN, END = 1500, 700, 1000
 """Readings of the gauge, one a second, and those that are changed."""
 
@@ -46,21 +42,13 @@ CAUSES = {
 
 @pytest.mark.parametrize("cause", CAUSES)
 def test_what_asks_for_more_has_an_episode_of_its_own(cause):
+    """Afterwards, and while it lasts."""
     tuning, change = CAUSES[cause]
-    told, _ = found(change, tuning)
-    assert set(told) == {"sensor", "lost"}
-    assert (told["sensor"].cause, told["lost"].cause) == ("wide", cause)
-    assert (told["lost"].start, told["lost"].end) == pytest.approx((BEGIN + 1.0, END), abs=1e-6)
-    assert told["sensor"].start < 60.0 and told["sensor"].end is None and "again" not in told["sensor"].text
-
-
-@pytest.mark.parametrize("cause", CAUSES)
-def test_while_it_lasts_both_do(cause):
-    tuning, change = CAUSES[cause]
-    told, _ = found(change, tuning, n=BEGIN + 120)
-    assert (told["sensor"].cause, told["lost"].cause) == ("wide", cause)
-    assert told["sensor"].end is None and told["lost"].end is None
-    assert told["lost"].start == BEGIN + 1.0
+    for n, end in ((N, END), (BEGIN + 120, None)):
+        told, _ = found(change, tuning, n)
+        assert {key: each.cause for key, each in told.items()} == {"sensor": "wide", "lost": cause}
+        assert (told["lost"].start, told["lost"].end) == pytest.approx((BEGIN + 1.0, end), abs=1e-6)
+        assert told["sensor"].start < 60.0 and told["sensor"].end is None and "again" not in told["sensor"].text
 
 
 def test_what_is_of_one_cause_is_one_episode():

@@ -8,7 +8,7 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
 from estimators.diagnostics.effects import EVIDENCE, KINDS, gains
-from estimators.diagnostics.episodes import EpisodeTracker, episodes, judged_rows
+from estimators.diagnostics.episodes import EpisodeTracker, judged_rows
 from tests.estimators.diagnostics.episodes.test_find import SENSORS, folded
 
 FAULTS = {
@@ -87,11 +87,6 @@ def test_rows_before_those_that_are_kept_are_rejected():
     tracker.feed(judged.events, judged.track)
     with pytest.raises(IndexError, match="row 0 is not among rows"):
         tracker.feed(judged.events, judged.track, 0)
-
-
-def test_a_fold_is_fed_at_once():
-    fold = folded(**SENSORS["stuck"][0])
-    assert repr(episodes(fold)) == repr(tracked(judged_rows(fold), 65_536, [333]))
 
 
 @pytest.mark.parametrize("kind", [*KINDS, EVIDENCE])
