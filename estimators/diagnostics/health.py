@@ -28,6 +28,7 @@ from ..numerics.simd import total as sum_of
 from ..track import DIVERGED, FAILED, GATED, TRACKING, USED, borrowed_columns
 
 MIN_WINDOW_EVENTS = 10  # Events in a window below which it is not judged
+CLEARING = 0.5  # Share of the limits of divergence below which it is over
 MAX_EXACT = 2.0**30  # Whole numbers of which any sum over a window is exact
 MAX_ROWS_PER_READING = 20  # Rows for each measurement of the window, beyond which a measurement is too old to count
 
@@ -127,10 +128,9 @@ def write_window(i, total, due, kept, used, nis_low, nis_high, policy, track):
     track.nis_mean[i] = total / used if used > 0 else np.nan
     track.nis_low[i] = nis_low
     track.nis_high[i] = nis_high
-    refused = kept - used
-    track.consistency[i] = TRACKING
-    if kept >= MIN_WINDOW_EVENTS and (refused > policy.diverged_gated * kept or total > policy.diverged_nis * due):
-        track.consistency[i] = DIVERGED
+    limit = CLEARING if i > 0 and track.consistency[i - 1] == DIVERGED else 1.0
+    lost = kept - used > limit * policy.diverged_gated * kept or total > limit * policy.diverged_nis * due
+    track.consistency[i] = DIVERGED if kept >= MIN_WINDOW_EVENTS and lost else TRACKING
 
 
 @embedded

@@ -334,11 +334,11 @@ def _fold_share(place, crew):
                 code, context, rule, 1, n, 1, own_t, kind, channel, own_value, columns,
                 now.clock, now.u, now.filter, now.doubt, now.edge, spare, work, score, track, variances, passed, 0,
             )  # fmt: skip
+            track.consistency[0] = int(last[CONSISTENCY])
             if judges(track.verdict[1]):
                 slide(1, n, channel[1], block, normal, white, policy, bounds, terms, track)
             else:
-                own_t[0] = times[T] if n > 0 else own_t[1]
-                track.age[0], track.consistency[0] = last[AGE], int(last[CONSISTENCY])
+                own_t[0], track.age[0] = times[T] if n > 0 else own_t[1], last[AGE]
                 track.nis_mean[0], track.nis_low[0], track.nis_high[0] = last[NIS_MEAN], last[NIS_LOW], last[NIS_HIGH]
                 keep_window(1, own_t, track)
             watch_row(1, own_t, kind, channel, own_value, context, policy, now.evidence, track)

@@ -8,7 +8,7 @@ import numpy as np
 
 from ...log import INPUT
 from ...model.state_space import Input, State
-from ...track import DIVERGED, GATED, HEALTH_NAMES, SCREENED, STALE, WAITING
+from ...track import DIVERGED, GATED, HEALTH_NAMES, SCREENED, STALE, USED, WAITING
 from ..detectors import (
     IMPOSSIBLE_AT,
     IMPOVERISHED,
@@ -88,6 +88,7 @@ def left_ranges(judged: JudgedRows) -> Iterator[FoundEpisode]:
     t = events.t
     if not np.any(track.flags & ~SENSOR_MASK):
         return
+    told = np.flatnonzero((track.verdict == USED) | (track.verdict == GATED))  # of corrections
     for column, state in enumerate(model.shown_states):
         mean, half = track.mean[:, column], HALF_WIDTH * track.std[:, column]
         yield from _outside(state, mean, t)
@@ -97,7 +98,7 @@ def left_ranges(judged: JudgedRows) -> Iterator[FoundEpisode]:
             rows = proven | (mean + half < low) | (mean - half > high)
             yield from _beyond(state, "impossible", rows, mean, t, state.limits)
         if state.watched:
-            yield from _beyond(state, "corrected", track.flags & memory_flag(column) != 0, mean, t)
+            yield from _beyond(state, "corrected", track.flags[told] & memory_flag(column) != 0, mean[told], t[told])
     rows = np.flatnonzero(events.kind == INPUT)
     for j, item in enumerate(model.inputs):
         value = events.value[rows, j]

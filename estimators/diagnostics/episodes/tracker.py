@@ -28,7 +28,7 @@ MAX_BYTES = 16 * 2**20  # Memory of the kept rows; rows of a large field are few
 
 CONDITIONS = (sensor_alarms, dropouts, left_ranges, impoverished_particles, lost_estimates, silent_gaps)
 
-JOINED_ROWS = {**dict.fromkeys(ALARM_KEYS, JOINED), "outside": JOINED, "impossible": JOINED}
+JOINED_ROWS = dict.fromkeys([*ALARM_KEYS, "outside", "impossible", "corrected"], JOINED)
 """Rows without an alarm that an episode bridges, by the first part of its key; 0 for the others."""
 
 REJECTIONS = {"refused": GATED, "screened": SCREENED}  # Verdict on the measurements of an episode, by its cause

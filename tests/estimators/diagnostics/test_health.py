@@ -221,7 +221,7 @@ def by_definition(t, kind, channel, track, normal, policy):
     judged = np.isin(track.verdict, (USED, GATED, FAILED))
     whole = np.arange(1, 3 * policy.window + 1)
     quantiles = [chi2.ppf(q, whole) for q in (0.025, 0.975)]
-    resets = np.flatnonzero(kind == RESET)
+    resets, lost = np.flatnonzero(kind == RESET), False
     for i in range(len(t)):
         # The row that last changed the window.
         e = max([k for k in range(i, -1, -1) if judged[k] or kind[k] == RESET][:1] or [0])
@@ -239,8 +239,10 @@ def by_definition(t, kind, channel, track, normal, policy):
             bounds = (mean / free * np.interp(free, whole, quantile) / len(used) for quantile in quantiles)
             values = [total / len(used), *bounds]
         refused = len(rows) - len(used)
-        lost = refused > policy.diverged_gated * len(rows) or total > policy.diverged_nis * due
-        yield (t[i] - t[e]) / SECOND, *values, DIVERGED if len(rows) >= MIN_WINDOW_EVENTS and lost else TRACKING
+        limit = 0.5 if lost else 1.0  # what was lost is until it is half as bad
+        lost = refused > limit * policy.diverged_gated * len(rows) or total > limit * policy.diverged_nis * due
+        lost &= len(rows) >= MIN_WINDOW_EVENTS
+        yield (t[i] - t[e]) / SECOND, *values, DIVERGED if lost else TRACKING
 
 
 @pytest.mark.parametrize("seed", range(3))

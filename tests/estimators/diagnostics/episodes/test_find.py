@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from estimators.diagnostics.detector_state import no_baseline
-from estimators.diagnostics.detectors import BITS, CAUSES, IMPOVERISHED, NARROW, SHIFTED, SPIKY, STUCK
+from estimators.diagnostics.detectors import BITS, CAUSES, IMPOVERISHED, NARROW, SHIFTED, SPIKY, STUCK, memory_flag
 from estimators.diagnostics.episodes import JOINED, Episode, episode_json, episodes, found_in, judged_rows
 from estimators.diagnostics.episodes.wording import SensorFacts
 from estimators.diagnostics.health import HealthPolicy
@@ -267,23 +267,23 @@ def test_an_impoverished_cloud():
 # Runs of alarms
 
 
-def alarmed(*readings):
-    """Alarms of the gauge at those of its readings, in a fold that is in order."""
+def alarmed(*readings, cause="narrow"):
+    """Alarms of the gauge at those of its readings, or a state corrected at those of all; else all is in order."""
     judged = judged_rows(folded())
     track = judged.track.copy()
-    track.alarms[judged.events.of_sensor(0)[list(readings)], 0] = NARROW
+    if cause == "corrected":
+        track.flags[np.flatnonzero(judged.events.kind == READING)[list(readings)]] = memory_flag(0)
+    else:
+        track.alarms[judged.events.of_sensor(0)[list(readings)], 0] = NARROW
     return found_in(judged._replace(track=track))
 
 
-def test_alarms_that_follow_each_other_are_one_episode():
-    """With 30 quiet readings between them they do; with 31 they do not."""
-    assert len(alarmed(100)) == 1
-    assert len(alarmed(100, 101 + JOINED)) == 1
-    assert len(alarmed(100, 102 + JOINED)) == 2
-
-
-def test_an_episode_lasts_while_it_may_go_on():
-    ended, lasting = alarmed(N - 2 - JOINED), alarmed(N - 1 - JOINED)
+@pytest.mark.parametrize(("cause", "readings"), [("narrow", N), ("corrected", 2 * N)])
+def test_alarms_that_follow_each_other_are_one_episode_which_lasts_while_it_may_go_on(cause, readings):
+    """With 100 quiet readings between them they do; with 101 they do not."""
+    for first, count in ((101 + JOINED, 1), (102 + JOINED, 2)):
+        assert len(alarmed(100, first, cause=cause)) == count
+    ended, lasting = (alarmed(readings - k - JOINED, cause=cause) for k in (2, 1))
     assert ended[0].episode.end is not None and lasting[0].episode.end is None
 
 

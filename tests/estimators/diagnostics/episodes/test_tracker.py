@@ -7,8 +7,10 @@ import pytest
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
+from estimators.diagnostics.detectors import memory_flag
 from estimators.diagnostics.effects import EVIDENCE, KINDS, gains
 from estimators.diagnostics.episodes import EpisodeTracker, judged_rows
+from estimators.log import READING
 from tests.estimators.diagnostics.episodes.test_find import SENSORS, folded
 
 FAULTS = {
@@ -16,6 +18,7 @@ FAULTS = {
     "silent": {"skip": (0,)},
     "outside": {"feed": 3.0},
     "gap": {},
+    "corrected": {},
 }
 GAP_S = 20.0
 
@@ -23,6 +26,9 @@ GAP_S = 20.0
 @cache
 def rows_with(fault):
     judged = judged_rows(folded(**FAULTS[fault]))
+    if fault == "corrected":
+        rows = np.flatnonzero(judged.events.kind == READING)
+        judged.track.flags[rows[(rows > 1000) & (np.arange(rows.size) % 140 < 50)]] |= memory_flag(0)
     if fault != "gap":
         return judged
     late = np.arange(len(judged.track)) >= len(judged.track) // 2
@@ -72,9 +78,9 @@ def test_a_gap_of_a_recording_without_any_event_is_an_episode():
     assert not [item for item in tracked(judged._replace(stale_after=30.0), 65_536, [1000]) if item.cause == "stale"]
 
 
-@pytest.mark.parametrize("cause", SENSORS)
+@pytest.mark.parametrize("cause", [*SENSORS, "corrected"])
 def test_rows_that_are_dropped_do_not_move_the_ends(cause):
-    judged, subject = rows_with(cause), SENSORS[cause][1][0]
+    judged, subject = rows_with(cause), SENSORS[cause][1][0] if cause in SENSORS else "level"
     (expected,) = (item for item in tracked(judged, 65_536, [1000]) if item.subject.startswith(subject))
     (found,) = (item for item in tracked(judged, 1501, [1000]) if item.subject.startswith(subject))
     assert (found.cause, found.start) == (expected.cause, expected.start)
