@@ -153,7 +153,12 @@ def _signals_topic(every: list[Signal]) -> Topic:
             one.levels,
             one.resolution,
             one.noise,
-            KINDS.get(one.kind, "an angle that wraps" if one.wraps else _noise_remark(one)),
+            KINDS.get(
+                one.kind,
+                "an angle that wraps"
+                if one.wraps
+                else "noise is its resolution" * (one.noise <= 1.01 * one.resolution / math.sqrt(12.0)),
+            ),
         )
         for one in shown
     )
@@ -162,10 +167,6 @@ def _signals_topic(every: list[Signal]) -> Topic:
     more = len(every) - len(shown)
     notes = (f"{more} more are constant or not listed; --json has all",) if more else ()
     return Topic("Signals", notes, columns, rows)
-
-
-def _noise_remark(one: Signal) -> str:
-    return "noise is its resolution" if one.noise <= 1.01 * one.resolution / math.sqrt(12.0) else ""
 
 
 def _plan_topics(drafted: DraftPlan) -> list[Topic]:

@@ -14,7 +14,6 @@ from typing import NamedTuple
 
 import numpy as np
 
-from estimators.diagnostics.detectors import detector_of
 from estimators.diagnostics.episodes import ALARM_KEYS, Episode, EpisodeTracker, TrackedEpisode
 from estimators.diagnostics.episodes.tracker import MAX_ROWS
 from estimators.diagnostics.held_out import Offset, offsets
@@ -22,6 +21,7 @@ from estimators.registry import find_estimator
 from estimators.track import ADVISORY, DIVERGED, HEALTH_NAMES, TRACKING, WAITING, estimated_rows
 
 from ..format_time import duration_text
+from ..leading import leading, severity
 from .counts import last_run
 from .jobs import Job
 from .outputs import Pull
@@ -45,56 +45,42 @@ MAX_NOTICES = 5
 SENSOR_KEYS = (*ALARM_KEYS, "silence")
 """First parts of the keys of a sensor's episodes; the second is its name."""
 
-LOST_SEVERITY, DEFAULT_SEVERITY = detector_of("silent").severity, detector_of("").severity
-
 
 class EpisodeSummary(NamedTuple):
-    """Episodes of one moment in the order of their start, those that last, and offsets of held-out sensors.
+    """Entries of one moment in the order of their start, those that last, and offsets of held-out sensors.
 
-    `revision` is that of the rows, `entries` are the episodes with their keys.
+    `revision` is that of the rows.
     """
 
-    episodes: tuple[Episode, ...] = ()
+    entries: tuple[TrackedEpisode, ...] = ()
     lasting: tuple[TrackedEpisode, ...] = ()
     offsets: tuple[Offset, ...] = ()
     revision: int = -1
-    entries: tuple[TrackedEpisode, ...] = ()
 
     def at(self, seconds: float) -> EpisodeSummary:
         """Return the summary of an earlier time, s: of the episodes that lasted then."""
-
-        def lasted(episode: Episode) -> bool:
-            return episode.start <= seconds and (episode.end is None or episode.end > seconds)
-
-        lasting = tuple(entry for entry in self.entries if lasted(entry.episode))
+        lasting = tuple(item for item in self.entries if item.episode.start <= seconds < (item.episode.end or np.inf))
         return self._replace(lasting=lasting, offsets=())
 
-    def leading(self, states: Mapping[str, str]) -> Episode | None:
-        """Return the most severe of those that last, the newest of several.
+    @property
+    def episodes(self) -> list[Episode]:
+        """All of them."""
+        return [entry.episode for entry in self.entries]
 
-        By its state a sensor may be lost, or consistent again: then its episode, which lasts until its end is certain,
-        comes last.
-        """
-
-        def order(entry: TrackedEpisode) -> tuple[bool, int, float]:
-            kind, name = entry.key
-            state = states.get(name) if kind in SENSOR_KEYS else None
-            severity, newest = _severity(entry.episode)
-            severity = min(severity, LOST_SEVERITY) if state in ("degraded", "stale") else severity
-            return state == "tracking", severity, newest
-
-        first = min(self.lasting, key=order, default=None)
-        return None if first is None else first.episode
+    @property
+    def open(self) -> list[Episode]:
+        """Those that last."""
+        return [entry.episode for entry in self.lasting]
 
     @property
     def in_alarm(self) -> frozenset[str]:
         """Sensors with an open episode, whose rejected measurements need no report of their own."""
         return frozenset(entry.key[1] for entry in self.lasting if entry.key[0] in ALARM_KEYS)
 
-    def of_sensors(self, names: Sequence[str], states: Sequence[str]) -> dict[str, tuple[str, str]]:
+    def of_sensors(self, states: Mapping[str, str]) -> dict[str, tuple[str, str]]:
         """Return the state of each sensor, with the text of its most severe open episode."""
-        found = {name: (state, "") for name, state in zip(names, states, strict=True)}
-        for entry in sorted(self.lasting, key=lambda entry: _severity(entry.episode), reverse=True):
+        found = {name: (state, "") for name, state in states.items()}
+        for entry in sorted(self.lasting, key=lambda entry: severity(entry.episode), reverse=True):
             kind, name = entry.key
             if kind in SENSOR_KEYS and found[name][0] not in ("waiting", "tracking"):
                 found[name] = (found[name][0], entry.episode.text)
@@ -102,12 +88,6 @@ class EpisodeSummary(NamedTuple):
             if found[offset.sensor][0] == "held out":
                 found[offset.sensor] = "held out", offset.words
         return found
-
-
-def _severity(episode: Episode) -> tuple[int, float]:
-    """Sort key: the most severe first, of these the newest; advisories last."""
-    severity = detector_of(episode.cause).severity
-    return severity + DEFAULT_SEVERITY * (episode.grade == "advisory"), -episode.start
 
 
 class EpisodeLog:
@@ -189,11 +169,10 @@ class EpisodeLog:
             self._entries = sorted([*tracker.entries, *self._others()], key=lambda entry: entry.episode.start)
             entries = _joined(self._earlier, self._entries)
             self.summary = EpisodeSummary(
-                tuple(entry.episode for entry in entries),
+                tuple(entries),
                 tuple(entry for entry in entries if entry.episode.end is None),
                 tuple(offsets(tracker.events, tracker.track, tracker.tuning)),
                 self._cursor.revision,
-                tuple(entries),
             )
             self._report(before, again, passage)
 
@@ -208,13 +187,13 @@ class EpisodeLog:
         health = int(track.health[-1])
         if health != self._health:
             self._health = health
-            leading = self.summary.leading({name: state for name, (state, _) in self._engine.status().sensors.items()})
-            text = f"health: {HEALTH_NAMES[health]}"
-            estimated = estimated_rows(track.select(slice(-1, None)))[0]
-            if health not in (WAITING, TRACKING) and leading is not None and estimated:
-                new = [entry for entry in begun if entry.episode is leading]
-                text += f": {leading.text}" if new else f": {leading.subject} {leading.cause}"
-                begun = [entry for entry in begun if entry.episode is not leading]
+            status, text = self._engine.status(), f"health: {HEALTH_NAMES[health]}"
+            states = {name: state for name, (state, _) in status.sensors.items()}
+            found, words = leading(self.tracker.model, self.summary.open, states, track, status.inputs)
+            if words and estimated_rows(track.select(slice(-1, None)))[0]:
+                new = [entry for entry in begun if entry.episode in found[:1]]
+                text += f": {words if new or not found else f'{found[0].subject} {found[0].cause}'}"
+                begun = [entry for entry in begun if entry not in new]
             level = {WAITING: "info", TRACKING: "info", ADVISORY: "info", DIVERGED: "error"}.get(health, "warn")
             say(text, level=level, t=int(t[last_run(track.health)]))
         for episode in (entry.episode for entry in begun[:MAX_NOTICES]):

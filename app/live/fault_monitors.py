@@ -80,13 +80,14 @@ class RootCause:
         unaffected = self._levels.unaffected.get(episode.subject) if detector_of(episode.cause).alarms else None
         return episode._replace(text=f"{text}; not affected: {unaffected}" if unaffected and not episode.end else text)
 
-    def primary(self, episode: Episode) -> Episode:
-        """Return the open episode of the sensor that is most likely faulty in this one; this one if it is its own.
+    def primary(self, episodes: Sequence[Episode]) -> Episode:
+        """Return the one of the sensor that is most likely faulty in the first, or the first.
 
         A filter follows a biased sensor, so that in time consistent sensors contradict it.
         """
-        row = self._found[episode.subject].row if _is_open(episode) and episode.subject in self._found else None
-        return next((other for other in self._episodes() if _is_open(other) and other.subject == row), episode)
+        first = episodes[0]
+        row = self._found[first.subject].row if _is_open(first) and first.subject in self._found else None
+        return next((other for other in episodes if other.subject == row), first)
 
     def update(self, job: Job) -> None:
         """Isolate the faults of the open episodes that have grown enough."""

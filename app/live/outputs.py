@@ -14,7 +14,7 @@ from estimators.diagnostics.clock_fit import ClockFit
 from estimators.diagnostics.consistency import NisVerdict
 from estimators.diagnostics.field_pictures import Picture
 from estimators.diagnostics.health import HealthPolicy
-from estimators.diagnostics.references import withheld_reasons
+from estimators.diagnostics.references import WITHHELD
 from estimators.diagnostics.sensitivity import Bound, Smallest
 from estimators.fold import Fold
 from estimators.log import Events, Log
@@ -286,4 +286,4 @@ class Status:
     @property
     def withheld(self) -> dict[str, str]:
         """The reason of each state whose estimate is withheld."""
-        return withheld_reasons(self.grades)
+        return {name: reason for name, (grade, reason) in self.grades.items() if grade == WITHHELD}

@@ -503,7 +503,8 @@ class Running(ABC):
         if first < end:
             self._inserted(first)
         if first < shown:
-            self._go_back(first)
+            self._fold.rewind(first)
+            self._row_counts.changed(first)
             again = int(np.searchsorted(self._log.t[: self._log.n], newest, side="right"))
             self._fold.advance(again - self._fold.n)
         self._batches.advance(self._fold)
@@ -513,11 +514,6 @@ class Running(ABC):
     def _behind(self) -> bool:
         """Whether events wait to be folded."""
         return not self._fold.idle and self._fold.n < self._log.n
-
-    def _go_back(self, index: int) -> None:
-        """Fold the events from `index` on again."""
-        self._fold.rewind(index)
-        self._row_counts.changed(index)
 
     def _inserted(self, index: int) -> None:
         """Let every cursor fetch the events from `index` on again, and refolds fold them again."""

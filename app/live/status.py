@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 
 from estimators.diagnostics.consistency import NisVerdict
-from estimators.diagnostics.detector_state import SENSOR_STATES, sensor_states, sensor_states_over_time
+from estimators.diagnostics.detector_state import sensor_states
 from estimators.diagnostics.health import MAX_ROWS_PER_READING, HealthPolicy
 from estimators.diagnostics.references import own_grades
 from estimators.diagnostics.score import nis_verdict
@@ -20,6 +20,7 @@ from estimators.track import FAILED, GATED, USED, Track, estimated_rows
 from estimators.tuning import Tuning
 from sources.source import Source
 
+from ..leading import leading, states_of_rows
 from .counts import RowCounts, last_run
 from .faults import Faulty
 from .outputs import Status
@@ -62,7 +63,6 @@ def status_of(
     states = sensor_states(model, fold.tuning.used, fold.evidence, (t or 0) * 1e-9, fold.policy)
     health = int(track.health[last]) if last >= 0 else watchers.silence.health
     account = watchers.episode_log.summary
-    leading = account.leading(dict(zip(model.sensor_names, states, strict=True)))
     layer = source.faults if isinstance(source, Faulty) else None
     optional = {**late, "recovered": fold.recoveries()}
     columns = track.mean, track.std
@@ -72,8 +72,10 @@ def status_of(
         t=t,
         health=health,
         since=int(log.t[last_run(track.health)]) if last >= 0 else None,
-        cause=watchers.cause(leading, health) if last >= 0 else _cause_without_rows(fold, watchers, fields),
-        sensors=account.of_sensors(model.sensor_names, states),
+        cause=watchers.cause(*leading(model, account.open, states, track, fold.u))
+        if last >= 0
+        else _cause_without_rows(fold, watchers, fields),
+        sensors=account.of_sensors(states),
         episodes_open=len(account.lasting),
         lost=watchers.alerts.lost,
         model_version=log.version if t is None else model_version_at(log, t),
@@ -134,7 +136,7 @@ def past_status(engine: Running, watchers: Watchers, t: int) -> Status:
     track, health = pull.track, int(pull.track.health[-1])
     nis = _nis_of_window(tuning, policy, pull.events, track)
     if fold is None:
-        states = [_state_of_rows(pull.events, track, s, used) for s, used in enumerate(tuning.used)]
+        states = states_of_rows(model, tuning.used, pull.events, track)
         told = pull.events.value[pull.events.kind == INPUT, : model.nu].T
         known = [row[np.isfinite(row)] for row in told]
         inputs = np.array(
@@ -149,14 +151,13 @@ def past_status(engine: Running, watchers: Watchers, t: int) -> Status:
         since = int(pull.events.t[begun])
         pull = engine.rows(pull.first - SINCE_ROWS, pull.first if not begun else 0)
     account = watchers.episode_log.summary.at(now * 1e-9)
-    leading = account.leading(dict(zip(model.sensor_names, states, strict=True)))
     return replace(
         status,
         t=now,
         health=health,
         since=since,
-        cause=watchers.cause(leading, health, past=True),
-        sensors=account.of_sensors(model.sensor_names, states),
+        cause=watchers.cause(*leading(model, account.open, states, track, inputs), past=True),
+        sensors=account.of_sensors(states),
         episodes_open=len(account.lasting),
         lost=None if estimated_rows(track.select(slice(-1, None)))[0] else now,
         nis=nis,
@@ -166,12 +167,6 @@ def past_status(engine: Running, watchers: Watchers, t: int) -> Status:
         std=track.std[-1].copy(),
         inputs=inputs,
     )
-
-
-def _state_of_rows(events: Events, track: Track, s: int, used: bool) -> str:
-    """Return the state of sensor s as the last of these rows that concern it show it."""
-    rows, states = sensor_states_over_time(events, track, s)
-    return "held out" if not used else SENSOR_STATES[states[-1]] if rows.size else "waiting"
 
 
 def _nis_of_window(tuning: Tuning, policy: HealthPolicy, events: Events, track: Track) -> NisVerdict:

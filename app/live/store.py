@@ -523,7 +523,7 @@ class StoreWriter:
             "tuning": ((tail.estimator, tail.tuning), partial(tuning_to_json, tail.tuning, tail.estimator)),
             "runs": (runs, lambda: json.dumps([_run_to_json(run) for run in runs])),
             "annotations": (notes, lambda: json.dumps([asdict(note) for note in notes])),
-            "episodes": (episodes, lambda: json.dumps([_episode_to_json(entry) for entry in episodes])),
+            "episodes": (episodes, lambda: json.dumps([{**entry._asdict(), "dropped": None} for entry in episodes])),
         }
         changed = {
             name: text()
@@ -573,10 +573,6 @@ def _is_same(one: Any, other: Any) -> bool:
     if isinstance(one, tuple) and isinstance(other, tuple):
         return len(one) == len(other) and all(a is b for a, b in zip(one, other, strict=True))
     return one is other
-
-
-def _episode_to_json(entry: TrackedEpisode) -> dict[str, Any]:
-    return {"key": entry.key, "at": entry.at, "until": entry.until, "episode": [*entry.episode]}
 
 
 def _twin_to_json(twin: Twin) -> str:

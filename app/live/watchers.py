@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 import time
 from collections import Counter, deque
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from types import SimpleNamespace
 
 import numpy as np
@@ -15,7 +15,7 @@ from estimators.diagnostics.detectors import detector_of
 from estimators.diagnostics.episodes import Episode, TrackedEpisode
 from estimators.diagnostics.repeats import HELD, RECENT, UNDECIDED, latest_repeats, sensor_rows
 from estimators.log import INPUT, READING, Events
-from estimators.track import STALE, TRACKING, WAITING
+from estimators.track import STALE, WAITING
 from sources.source import LOST_FRAMES, Source, controls_of, is_utc
 
 from ..ingest import dropped_episode
@@ -72,14 +72,12 @@ class Watchers:
         account = self.episode_log.summary
         return tuple(map(self.root_cause.with_fault, account.episodes)) if account.revision == revision else ()
 
-    def cause(self, leading: Episode | None, health: int, *, past: bool = False) -> str:
-        """Return the cause of a health: frames that the bus loses at present, or the leading episode, or its cause."""
-        if leading is None or health in (WAITING, TRACKING):
-            return ""
-        losing = None if past else self._notices.latest(LOST_FRAMES, LOSS_CAUSE_S)
-        if losing is not None:
-            return losing
-        return self.root_cause.with_fault(self.root_cause.primary(leading)).text
+    def cause(self, found: Sequence[Episode], words: str, *, past: bool = False) -> str:
+        """Return the cause of a health: of what `leading` returns, unless the bus loses frames at present."""
+        losing = None if past or not words else self._notices.latest(LOST_FRAMES, LOSS_CAUSE_S)
+        if losing is not None or not found:
+            return losing or words
+        return self.root_cause.with_fault(self.root_cause.primary(found)).text
 
 
 class IdleTicks:

@@ -22,10 +22,9 @@ from estimators.diagnostics.calibration import (
 )
 from estimators.diagnostics.considered_shares import known_stds, source_texts, variance_shares
 from estimators.diagnostics.consistency import nees
-from estimators.diagnostics.detectors import detector_of
 from estimators.diagnostics.episodes import Episode, episode_json
 from estimators.diagnostics.failure_cause import failures
-from estimators.diagnostics.references import own_grades, state_grades, state_health, withheld, withheld_reasons
+from estimators.diagnostics.references import WITHHELD, own_grades, state_grades, state_health, withheld
 from estimators.diagnostics.score import Fit, Score, health_of, score
 from estimators.diagnostics.sensitivity.suspects import Suspect, in_words, isolates, likeliest, odds, suspects
 from estimators.errors import NisusError
@@ -37,12 +36,13 @@ from estimators.plausibility import reasons_by_sensor
 from estimators.registry import find_entry
 from estimators.smoothing.smooth import consistency
 from estimators.smoothing.walk import Smoothed
-from estimators.track import FAILED, HEALTH_NAMES, REASONS, TRACKING, USED, Track
+from estimators.track import FAILED, HEALTH_NAMES, REASONS, USED, Track
 from estimators.tuning import SHARED_ENTRY_ROWS
 from sources.source import WRONG_TIME
 
 from ..format_time import counted, duration_text, format_time
 from ..ingest import dropped_episode
+from ..leading import leading, states_of_rows
 from ..present.export.calibration_lines import COVERAGE_HEAD, calibration_lines, coverage_rows, health_shares
 from ..present.result import Figure, Topic, plain
 from ..present.series.columns import units_by_name
@@ -217,23 +217,7 @@ def explained(fold: Fold, episodes: Sequence[Episode]) -> list[ExplainedEpisode]
 
 
 def fold_json(result: FoldResult) -> dict[str, Any]:
-    """Return a fold for scripts.
-
-    `rmse` and `coverage` (share of errors inside the 95 % band) are by state, `held_out` by sensor row, in their units.
-    `stale` counts measurements that came too late and are not in `readings`, `wrong_time` events with impossible times,
-    `inflated` late ones used on arrival, `conditioned` those rejected by a condition of the source's map. `screened`
-    counts rejections before the filter by sensor and reason, with these as `condition`. `late` and `degraded_after` are
-    decisions on time, with reasons. `health` is the share of time in each state; `start` and `end` bound the scored
-    part, s. `coverage_bins` has the coverage of the 95 % bands by time and by operating point (`CoverageBin`), with
-    that of the adaptive conformal interval. `log_likelihood` includes the price of rejected measurements, which
-    `log_likelihood_used` leaves out; `refused` is their share. `calibration` has an entry per sensor row and per state
-    with known truth. `nees` is null without truth (`TruthNees`). `variance` has the share of each state's last variance
-    by considered parameter, and the rest as `noise`, and `known` the deviation that would be left if one of them were
-    known; they are empty where none is considered. `episodes` have start and end in seconds of the log (end null while
-    one lasts) and `suspects`. `withheld` has the share of events of each state with a limit (`withhold`) in which its
-    estimate is not shown, and the reason at the end, null where it is shown there. `smoothed` has `rmse`, `coverage`
-    and `consistency` of the smoothed states.
-    """
+    """Return a fold for scripts; docs/reference.md describes its fields."""
     twin, fold, scored, counts = result.twin, result.fold, result.score, result.counts
     smoothing = result.smoothing
     cov = fold.moments()[1] if fold.model.considered else None
@@ -282,7 +266,6 @@ def fold_json(result: FoldResult) -> dict[str, Any]:
         "account": fold.account(),
         "health": health_of(result.events, result.track, fold.policy),
         "states": _grades(result),
-        "withheld": _withheld(result),
         "calibration": [calibration_json(entry) for entry in result.calibration],
         "coverage_bins": result.coverage,
         "variance": variance_shares(fold.model, cov) if cov is not None else {},
@@ -293,28 +276,16 @@ def fold_json(result: FoldResult) -> dict[str, Any]:
     return plain(found)  # type: ignore[no-any-return]
 
 
-def _withheld(result: FoldResult) -> dict[str, dict[str, Any]]:
-    """Return share and reason of withheld estimates, by state."""
-    model, track = result.twin.model, result.track
-    reasons = withheld_reasons(own_grades(model, track, result.fold.u)) if len(track) else {}
-    shares = withheld(model, track).mean(axis=0) if len(track) else np.zeros(len(model.shown_states))
-    return {
-        state.name: {"share": share, "reason": reasons.get(state.name)}
-        for state, share in zip(model.shown_states, shares.tolist(), strict=True)
-        if state.withhold < np.inf
-    }
-
-
 def _grades(result: FoldResult) -> dict[str, dict[str, Any]]:
     """Return grade and reason of each state at the end, and the share of time of each grade."""
     model, track, events, policy = result.twin.model, result.track, result.events, result.fold.policy
     if not len(track):
         return {}
-    lasting = [item.episode for item in result.episodes if item.episode.end is None]
-    leading = min(lasting, key=lambda episode: detector_of(episode.cause).severity, default=None)
-    health = int(track.health[-1])
-    cause = leading.text if leading is not None and health != TRACKING else ""
-    grades = state_grades(model, own_grades(model, track, result.fold.u), health, cause)
+    lasting = within([item.episode for item in result.episodes], events.select(slice(-1, None)))
+    told = held_inputs(model, result.fold.log.events)[result.part][-1]
+    u = np.where(np.isfinite(told), told, model.default_inputs)
+    _, cause = leading(model, lasting, states_of_rows(model, result.fold.tuning.used, events, track), track, u)
+    grades = state_grades(model, own_grades(model, track, u), int(track.health[-1]), cause)
     hidden, healths = withheld(model, track), (state_health(track, j) for j in range(len(grades)))
     return {
         name: {
@@ -444,8 +415,13 @@ def _figures(result: FoldResult) -> list[Figure]:
     return [
         *found,
         *(
-            Figure(f"withheld {name}", f"{item['share']:.1%} of the events", remark=item["reason"] or "")
-            for name, item in _withheld(result).items()
+            Figure(
+                f"withheld {name}",
+                f"{item['share'][WITHHELD]:.1%} of the time",
+                remark=item["reason"] * (item["grade"] == WITHHELD),
+            )
+            for name, item in _grades(result).items()
+            if item["share"][WITHHELD]
         ),
         Figure("final variances", ", ".join(f"{model.state_names[j]} {value**2:.5g}" for j, value in variances)),
         *(

@@ -45,7 +45,7 @@ from .metrics import metrics
 from .request_threads import in_rerun_thread, in_thread
 from .runs_api import RunsApi
 from .streams import PageStream, feed_rerun
-from .twin_json import annotations_json, audit_json, episodes_json, model_json, status_json
+from .twin_json import annotations_json, episodes_json, model_json, status_json
 from .viewer_assets import FILES, viewer_assets, viewer_version
 from .viser_proxy import ViserProxy
 
@@ -246,8 +246,9 @@ class PageServer:
         return annotations_json(self._engine)
 
     def _audit(self) -> list[dict[str, Any]]:
-        """Return the last commands of users."""
-        return audit_json(self._engine)
+        """Return the last commands of users by time, in seconds since 1970."""
+        names = ("number", "at", "user", "role", "address", "path", "body", "revision")
+        return [{name: getattr(entry, name) for name in names} for entry in self._engine.audit.entries()]
 
     def _faults(self) -> dict[str, Any]:
         """Return the faults that can be injected into the source."""

@@ -113,12 +113,6 @@ def episodes_json(engine: Running) -> list[dict[str, Any]]:
     ]
 
 
-def audit_json(engine: Running) -> list[dict[str, Any]]:
-    """Return the last commands of users by time, in seconds since 1970."""
-    names = ("number", "at", "user", "role", "address", "path", "body", "revision")
-    return [{name: getattr(entry, name) for name in names} for entry in engine.audit.entries()]
-
-
 def annotations_json(engine: Running) -> list[dict[str, Any]]:
     """Return all notes of users by time, in seconds of the log."""
     return [{"number": note.number, "at": note.t * 1e-9, "text": note.text} for note in engine.annotations.notes]

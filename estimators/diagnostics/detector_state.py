@@ -136,8 +136,8 @@ def _rows(model: StateSpaceModel, state: np.ndarray) -> np.ndarray:
 
 def sensor_states(
     model: StateSpaceModel, used: np.ndarray, state: np.ndarray, now: float, policy: HealthPolicy
-) -> list[str]:
-    """Return the present state of each sensor, one of `SENSOR_STATES`.
+) -> dict[str, str]:
+    """Return the present state of each sensor by its name, one of `SENSOR_STATES`.
 
     Args:
         model: The model.
@@ -160,7 +160,7 @@ def sensor_states(
         "advisory": alarms != 0,
     }
     words = np.select(list(cases.values()), list(cases), "tracking")
-    return [str(word) for word in words]
+    return dict(zip(model.sensor_names, words.tolist(), strict=True))
 
 
 def sensor_states_over_time(events: Events, track: Track, s: int) -> tuple[np.ndarray, np.ndarray]:
@@ -172,10 +172,10 @@ def sensor_states_over_time(events: Events, track: Track, s: int) -> tuple[np.nd
     silent = track.flags >> s & 1 != 0 if s < SENSOR_FLAGS else np.zeros(len(events), bool)
     reported = (events.kind == READING) & (events.channel == s) & (track.verdict != MISSING)
     rows = np.flatnonzero(silent | reported)
-    alarms = np.bitwise_or.reduce(track.alarms[rows], axis=1) * reported[rows]
-    advised = alarms & ADVISORY_ALARM != 0
-    cases = (track.verdict[rows] == HELD_OUT, silent[rows] | (alarms & LOST != 0), advised, alarms != 0)
-    words = [SENSOR_STATES.index(word) for word in ("held out", "degraded", "advisory", "suspect")]
+    own = track.alarms[rows] * reported[rows, None]
+    lost, acted_on = (own & LOST != 0).any(axis=1), ((own != 0) & (own & ADVISORY_ALARM == 0)).any(axis=1)
+    cases = (track.verdict[rows] == HELD_OUT, silent[rows] | lost, acted_on, own.any(axis=1))
+    words = [SENSOR_STATES.index(word) for word in ("held out", "degraded", "suspect", "advisory")]
     return rows, np.select(cases, words, SENSOR_STATES.index("tracking"))
 
 

@@ -11,7 +11,7 @@ from ..errors import spaced
 from ..events.batch import Events, truth_of
 from ..model.state_space import Input, State, StateSpaceModel
 from ..numerics.linalg import wrapped
-from ..track import HEALTH_NAMES, HELD_OUT, SUSPECT, WAITING, Track
+from ..track import HEALTH_NAMES, HELD_OUT, SUSPECT, TRACKING, WAITING, Track
 from .detectors import FAR_OUTSIDE, is_outside, memory_flag
 
 
@@ -83,16 +83,16 @@ WITHHELD = "withheld"  # Grade of a state beside those of health
 def state_grades(
     model: StateSpaceModel, own: Mapping[str, tuple[str, str]], health: int, cause: str
 ) -> dict[str, tuple[str, str]]:
-    """Return grade and reason of each shown state: its own, or the health of the twin with its cause, if that is worse.
+    """Return grade and reason of each shown state: its own, or the health of the twin with its cause if that is worse.
 
     Args:
         model: The model.
         own: Those of `own_grades`.
         health: Health of the twin; before the first measurement nothing is withheld.
-        cause: Its cause.
+        cause: Its cause, or "".
     """
-    twin = HEALTH_NAMES[health], cause
-    worse = [WITHHELD, HEALTH_NAMES[SUSPECT]] if health < SUSPECT else [WITHHELD]
+    twin = HEALTH_NAMES[health], "" if health == TRACKING else cause or f"the twin is {HEALTH_NAMES[health]}"
+    worse = [WITHHELD, HEALTH_NAMES[SUSPECT]] if health <= SUSPECT else [WITHHELD]
     return {
         name: own[name] if health != WAITING and name in own and own[name][0] in worse else twin
         for name in (state.name for state in model.shown_states)
@@ -130,11 +130,6 @@ def own_grades(model: StateSpaceModel, track: Track, u: np.ndarray) -> dict[str,
         for state, deviation, without in zip(model.shown_states, track.std[-1], withheld(model, track)[-1], strict=True)
         if without
     }
-
-
-def withheld_reasons(own: Mapping[str, tuple[str, str]]) -> dict[str, str]:
-    """Return the reason of each withheld state among those of `own_grades`."""
-    return {name: reason for name, (grade, reason) in own.items() if grade == WITHHELD}
 
 
 def references(model: StateSpaceModel, events: Events, track: Track) -> list[Reference]:

@@ -41,7 +41,7 @@ SURFACE_HEIGHT = 0.6  # Height of the highest value above the lowest; the longer
 class FieldView:
     """The latest pictures of a field, the kind that is chosen, and its scale; scenes draw them."""
 
-    def __init__(self, api: viser.SceneApi, model: StateSpaceModel, name: str, *, truth: bool) -> None:
+    def __init__(self, api: viser.SceneApi, model: StateSpaceModel, theme: Palette, name: str, *, truth: bool) -> None:
         assert model.grid is not None
         self._unit, self._name = model.grid.unit, name
         self._frame = Frame.of(model.grid)
@@ -56,6 +56,11 @@ class FieldView:
         self._size /= max(self._frame.width, self._frame.height)
         self._shapes = Shapes(api)
         self.root = self._shapes.frame()
+        self._build(model, theme)
+
+    def _build(self, model: StateSpaceModel, theme: Palette) -> None:
+        """Add the shapes."""
+        raise NotImplementedError
 
     def show(self, title: str) -> None:
         """Show the picture of that title."""
@@ -85,8 +90,7 @@ class FieldView:
 class FieldScene(FieldView):
     """Plane seen from above with one picture of the field, its scale, the sensors and the charted cells."""
 
-    def __init__(self, api: viser.SceneApi, model: StateSpaceModel, theme: Palette, name: str, *, truth: bool) -> None:
-        super().__init__(api, model, name, truth=truth)
+    def _build(self, model: StateSpaceModel, theme: Palette) -> None:
         frame, size = self._frame, self._size
         places, self._which = positioned(model)
         self._normalised = np.full(len(places), np.nan)
@@ -151,8 +155,7 @@ class FieldSurfaceScene(FieldView):
     Bars above and below it reach 2 σ to either side of the estimate.
     """
 
-    def __init__(self, api: viser.SceneApi, model: StateSpaceModel, theme: Palette, name: str, *, truth: bool) -> None:
-        super().__init__(api, model, name, truth=truth)
+    def _build(self, model: StateSpaceModel, theme: Palette) -> None:
         frame, half = self._frame, 0.5 * self._size
         sampled = np.linspace(0, 254, SURFACE_COLORS).round().astype(int)
         self._palettes = {name: colors[sampled] for name, colors in self._palettes.items()}

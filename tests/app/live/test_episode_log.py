@@ -1,16 +1,22 @@
 """The episode log: whatever order and pieces, its episodes are those of one fold of the log, and each is said once."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
+from app.leading import leading
 from app.live import commands
 from app.live.engine import Engine
-from app.live.episode_log import EpisodeLog, EpisodeSummary
-from estimators.diagnostics.episodes import Episode, TrackedEpisode, episodes
+from app.live.episode_log import EpisodeLog
+from estimators import Input
+from estimators.diagnostics.episodes import Episode, episodes
 from estimators.fold import Fold
 from estimators.log import Log
-from estimators.track import GATED
+from estimators.track import GATED, HEALTH_NAMES, Track
 from tests.app.scripted import MODEL, Replayed, Scripted, Stepped, readings, twin
+from tests.cases import cases
+from tests.models import level_model
 
 N = 1800
 """Readings, one a second: twice as noisy from the 300th to the 500th, stuck from the 1600th on."""
@@ -151,8 +157,8 @@ def test_what_lasts_hides_no_later_loss(engine, rows):
             lasting = {entry.key[0]: entry.episode for entry in episode_log.summary.lasting}
             assert {kind: each.cause for kind, each in lasting.items()} == {"sensor": "wide", "lost": "stuck"}
             assert lasting["lost"].start == pytest.approx(601.0)
-            worst = episode_log.summary.leading(dict(winding="degraded"))
-            assert worst is not None and worst.cause == "stuck"
+            folded, found = episode_log.tracker.track, [*lasting.values()]
+            assert leading(MODEL, found, {"winding": "degraded"}, folded, np.zeros(0))[0][0].cause == "stuck"
     wide, stuck = episode_log.summary.episodes
     expected = whole(engine)
     assert [(each.cause, each.start) for each in (wide, stuck)] == [(each.cause, each.start) for each in expected]
@@ -214,26 +220,17 @@ def test_a_refused_sensor_is_said_once_and_not_reading_by_reading(asset):
     assert sum("is rejected by the gate" in text for text in said(engine)) == 1
 
 
-def test_the_cause_is_that_of_a_sensor_that_is_lost_before_that_of_one_that_is_noisy():
-    def entry(kind, name, cause, start):
-        return TrackedEpisode(
-            (kind, name), 0, 0, Episode(start, None, name, cause, 1.0, 0.0, 2.0, "", f"{name} {cause}")
-        )
-
-    noisy, lost = entry("sensor", "a", "wide", 1.0), entry("sensor", "b", "narrow", 2.0)
-    account = EpisodeSummary((noisy.episode, lost.episode), (noisy, lost))
-    # Of two that are as bad the newest, whatever their order.
-    assert account.leading({"a": "suspect", "b": "suspect"}).text == "b narrow"
-    assert EpisodeSummary((), (lost, noisy)).leading({"a": "suspect", "b": "suspect"}).text == "b narrow"
-    assert account.leading({"a": "degraded", "b": "suspect"}).text == "a wide"
-    assert account.leading({"a": "suspect", "b": "degraded"}).text == "b narrow"
-    silent, gone = entry("silence", "c", "silent", 3.0), entry("twin", "diverged", "diverged", 4.0)
-    assert EpisodeSummary((), (noisy, silent)).leading({"a": "suspect", "c": "degraded"}).text == "c silent"
-    assert EpisodeSummary((), (noisy, silent, gone)).leading({"c": "stale"}).text == "diverged diverged"
-    # An advisory never hides what is to be acted on.
-    advised = noisy._replace(episode=lost.episode._replace(grade="advisory", start=9.0, text="advised"))
-    assert EpisodeSummary((), (advised, lost)).leading({"a": "advisory", "b": "suspect"}).text == "b narrow"
-    # A sensor in order again has an episode that lasts until it is certain to be over: the one that is lost leads.
-    assert account.leading({"a": "tracking", "b": "suspect"}).text == "b narrow"
-    assert EpisodeSummary((), (noisy,)).leading({"a": "tracking"}) is noisy.episode
-    assert EpisodeSummary().leading({}) is None
+@cases(__file__, "causes.csv")
+def test_the_cause_is_that_of_an_episode_in_alarm_with_the_grade_of_the_twin(health, flags, states, lasting, cause):
+    """Of a twin with two sensors, one of two rows, a state whose mean is 5, fitted up to 4, and an input of 1."""
+    model = level_model({"a": 1.0, "b": {"x": 1.0, "y": 1.0}}, 1e-6)
+    state = replace(model.states[0], fitted=(0.0, 4.0))
+    model = replace(model, states=(state,), inputs=(Input("drive", "V", fitted=(0.0, 2.0)),))
+    track = Track.allocate(1, 1, 0, 3)
+    track.mean[:], track.std[:], track.health[:], track.flags[:] = 5.0, 0.1, HEALTH_NAMES.index(health), int(flags)
+    of = dict(zip("ab", states.split(), strict=True))
+    found = [
+        Episode(float(start), None, subject, name, 1.0, 0.0, 2.0, "", f"{subject} {name}", grade)
+        for start, (subject, name, grade) in enumerate(item.split("/") for item in lasting.split())
+    ]
+    assert leading(model, found, of, track, np.ones(1))[1] == cause

@@ -15,10 +15,10 @@ TUNING = Tuning.of(MODEL).set("use.yoke", False).set("R.yoke", 0.25)
 P = 0.2  # variance of the prediction's error, which the readings of a while share
 
 
-def shown(innovations, tuning=TUNING):
+def shown(innovations, tuning=TUNING, verdict=HELD_OUT):
     n = len(innovations)
     track, t = Track.allocate(n, MODEL.nx, 0, 1), np.arange(n, dtype=np.int64) * 10**8
-    track.verdict[:] = HELD_OUT
+    track.verdict[:] = verdict
     track.innovation[:, 0], track.innovation_std[:, 0] = innovations, np.sqrt(P + 0.25)
     events = Events(t, t, np.full(n, READING, np.int8), np.full(n, YOKE, np.int32), np.zeros((n, 1)))
     return offsets(events, track, tuning)
@@ -59,12 +59,7 @@ def test_a_sensor_in_use_is_not_looked_at_and_one_without_others_says_so():
 
 
 def test_readings_that_were_used_before_it_was_held_out_do_not_count():
-    n = 40
-    track, t = Track.allocate(n, MODEL.nx, 0, 1), np.arange(n, dtype=np.int64)
-    track.verdict[:] = USED
-    track.innovation[:, 0], track.innovation_std[:, 0] = 5.0, 1.0
-    events = Events(t, t, np.full(n, READING, np.int8), np.full(n, YOKE, np.int32), np.zeros((n, 1)))
-    assert offsets(events, track, TUNING) == []
+    assert shown(np.full(40, 5.0), verdict=USED) == []
     assert Offset("yoke", "yoke", 1.0, 2.0, "1").words == (
         "yoke, held out: agrees with the other sensors (1 above the prediction, ±2 expected)"
     )

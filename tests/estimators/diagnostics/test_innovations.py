@@ -12,15 +12,11 @@ from estimators.diagnostics.innovations import (
     quantile_pairs,
     rank_histogram,
 )
+from tests.estimators.diagnostics.test_effects import correlated
 
 
 def series(phi, n=3000, seed=0):
-    rng = np.random.default_rng(seed)
-    e = np.empty(n)
-    e[0] = rng.normal()
-    for k in range(1, n):
-        e[k] = phi * e[k - 1] + np.sqrt(1 - phi * phi) * rng.normal()
-    return e
+    return correlated(np.random.default_rng(seed), phi, n)
 
 
 @pytest.mark.parametrize("phi", [0.0, 0.6, -0.4])

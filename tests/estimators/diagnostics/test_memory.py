@@ -8,7 +8,7 @@ import pytest
 from estimators.diagnostics.detectors import IMPOSSIBLE_AT, memory_flag
 from estimators.diagnostics.health import HealthPolicy
 from estimators.diagnostics.memory import fresh_memory, level_of, memory_of
-from estimators.diagnostics.references import HALF_WIDTH, own_grades, state_health
+from estimators.diagnostics.references import HALF_WIDTH, own_grades, state_grades, state_health
 from estimators.fleet.fleet import Fleet
 from estimators.fold import Fold
 from estimators.log import INPUT, READING, RESET, Log
@@ -123,6 +123,7 @@ def test_a_steady_error_that_no_sensor_shows_is_told_of_the_state_that_it_moves(
     assert not (fold.track.flags & memory_flag(1)).any() and np.array_equal(own, twin)
     found = own_grades(CELL, fold.track, fold.u)
     assert found == {"charge": ("suspect", "corrected by more than its band allows, over its memory or from its prior")}
+    assert state_grades(CELL, found, SUSPECT, "another")["charge"] == found["charge"]
     *_, unwatched, _ = told(0.9, replace(CELL, states=(replace(CELL.states[0], watched=False), CELL.states[1])))
     assert not unwatched.any()
 

@@ -26,6 +26,7 @@ SCRIPT = """
 import json
 from types import SimpleNamespace
 import numpy as np
+from app.leading import leading
 from app.live.episode_log import EpisodeSummary
 from app.present.export.report import episode_topic
 from app.web.twin_json import episodes_json
@@ -52,16 +53,16 @@ for begin in range(0, z.size, 170):
     rows = slice(begin, begin + 170)
     tracker.feed(judged.events.select(rows), judged.track.select(rows))
 lasting = tuple(entry for entry in tracker.entries if entry.episode.end is None)
-(state,) = sensor_states(model, fold.tuning.used, fold.evidence, 6000.0, fold.policy)
-summary = EpisodeSummary(tuple(found), lasting)
-leading = summary.leading({"gauge": state})
+states = sensor_states(model, fold.tuning.used, fold.evidence, 6000.0, fold.policy)
+summary = EpisodeSummary((), lasting)
+_, cause = leading(model, summary.open, states, fold.track, fold.u)
 about = dict(episodes=found, events=judged.events, track=judged.track, tuning=fold.tuning)
 print(json.dumps({
     "report": [list(row) for row in episode_topic(SimpleNamespace(**about)).rows],
     "rows": int(np.sum(fold.track.alarms[:, 0] >> ALARM_NAMES.index("rectified") & 1)),
     "episodes": [item._asdict() for item in found],
     "live": [item._asdict() for item in tracker.episodes],
-    "state": state, "leading": leading.text, "sensor": summary.of_sensors(["gauge"], [state])["gauge"],
+    "state": states["gauge"], "leading": cause, "sensor": summary.of_sensors(states)["gauge"],
     "help": detector_of("rectified").anchor, "json": episodes_json(SimpleNamespace(episodes=lambda: found)),
 }))
 """

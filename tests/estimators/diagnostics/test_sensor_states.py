@@ -3,11 +3,13 @@
 import numpy as np
 
 from estimators.diagnostics.detector_state import SENSOR_STATES, sensor_states, sensor_states_over_time
+from estimators.diagnostics.detectors import ADVISORY_ALARM, NARROW
 from estimators.diagnostics.episodes import episodes
 from estimators.diagnostics.health import HealthPolicy
 from estimators.fold import Fold
 from estimators.interface.table import table_of
-from estimators.log import Log
+from estimators.log import READING, Events, Log
+from estimators.track import USED, Track
 from tests.models import level_model
 from tests.support import SECOND
 from tests.support import folded as advanced
@@ -36,7 +38,8 @@ def folded(end: int, silent_from: int) -> Fold:
 
 
 def states(fold: Fold, used=(True, True, True)) -> list[str]:
-    return sensor_states(MODEL, np.array(used), fold.evidence, int(fold.log.t[fold.n - 1]) * 1e-9, POLICY)
+    now = int(fold.log.t[fold.n - 1]) * 1e-9
+    return list(sensor_states(MODEL, np.array(used), fold.evidence, now, POLICY).values())
 
 
 def test_each_sensor_has_a_state_of_its_own():
@@ -63,6 +66,14 @@ def test_along_the_track_it_changes_where_the_episodes_begin():
         assert of[name].cause in ("stuck", "silent") and of[name].start < events.t[rows[change]] / SECOND
     rows, codes = sensor_states_over_time(events, track, 0)
     assert {SENSOR_STATES[code] for code in codes} == {"tracking"} and rows.size == 180
+
+
+def test_a_sensor_is_advisory_while_all_of_its_rows_in_alarm_are():
+    track, zero = Track.allocate(2, 1, 0, 2), np.zeros(2, np.int32)
+    track.verdict[:], track.flags[:] = USED, 0
+    track.alarms[:] = [[NARROW | ADVISORY_ALARM, 0], [NARROW | ADVISORY_ALARM, NARROW]]
+    events = Events(zero, zero, np.full(2, READING), zero, np.zeros((2, 2)))
+    assert [SENSOR_STATES[code] for code in sensor_states_over_time(events, track, 0)[1]] == ["advisory", "suspect"]
 
 
 def test_the_table_has_alarms_and_flags_in_words():
