@@ -52,19 +52,19 @@ class AlertMessage(BaseModel):
     health: str
     since: str = Field(description="beginning of the condition, ISO 8601 in UTC, by the clock of this machine")
     sent: str = Field(description="time of this message, likewise")
-    value: float | None = Field(description="estimate or NIS concerned, null if there is none")
-    std: float | None = Field(description="standard deviation of the estimate")
-    limit: float | None
-    probability: float | None = Field(description="that the state is beyond the limit")
-    unit: str
+    value: float | None = Field(default=None, description="estimate or NIS concerned, null if there is none")
+    std: float | None = Field(default=None, description="standard deviation of the estimate")
+    limit: float | None = None
+    probability: float | None = Field(default=None, description="that the state is beyond the limit")
+    unit: str = ""
     guide: str = Field(description="section of the guide with diagnosis and response")
-    link: str | None = Field(description="the same on the page of the twin; null without a page")
-    response: str = Field(description="response by the guide")
+    link: str | None = Field(default=None, description="the same on the page of the twin; null without a page")
+    response: str = Field(default="", description="response by the guide")
 
 
 def alert_schema() -> dict[str, Any]:
     """Return the JSON Schema of an alert."""
-    return AlertMessage.model_json_schema()
+    return AlertMessage.model_json_schema(mode="serialization")
 
 
 class Finding(NamedTuple):
@@ -250,8 +250,15 @@ class AlertRules:
 
 def heartbeat(twin: str, health: str) -> AlertMessage:
     """Return the message that a twin runs."""
-    sent = iso_now()
-    rest: dict[str, Any] = dict.fromkeys(("value", "std", "limit", "probability", "link"))
-    rest |= {"rule": HEARTBEAT, "subject": "twin", "text": "the twin runs", "unit": "", "response": ""}
-    rest |= {"twin": twin, "id": HEARTBEAT, "status": HEARTBEAT, "health": health, "since": sent, "sent": sent}
-    return AlertMessage(guide=f"docs/alarms.md#{anchor(LOST_GUIDE)}", **rest)
+    return AlertMessage(
+        twin=twin,
+        id=HEARTBEAT,
+        status=HEARTBEAT,  # type: ignore[arg-type]
+        rule=HEARTBEAT,
+        subject="twin",
+        text="the twin runs",
+        health=health,
+        since=iso_now(),
+        sent=iso_now(),
+        guide=f"docs/alarms.md#{anchor(LOST_GUIDE)}",
+    )

@@ -1,6 +1,6 @@
 """CAN: the estimate as a virtual sensor on a bus, in frames that a DBC describes, which Nisus writes.
 
-Each state has two frames of eight bytes: its mean and its standard deviation, as float32. Both carry validity, health,
+Each state has two frames of eight bytes: its mean and its standard deviation, as float32. Both carry validity, grade,
 age, a counter, and a checksum over identifier and content.
 """
 
@@ -12,11 +12,12 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from config.source_schema import CanLogSection, CanSection
+from estimators.diagnostics.references import WITHHELD
 from estimators.errors import ConfigError, printable
 from estimators.track import HEALTH_NAMES
 
 from ..live.outputs import OutputLink
-from ..present.state_message import PublishedState, StateMessage
+from ..present.state_message import StateMessage
 from ..twin.sources.kind import find_databases
 
 if TYPE_CHECKING:
@@ -25,12 +26,14 @@ if TYPE_CHECKING:
     from ..live.running_fold import Running
 
 FRAME = struct.Struct("<fBBB")
-"""Value; counter (low four bits) and health; validity; age in steps of 10 ms, 255 for 2.55 s and more."""
+"""Value; counter (low four bits) and grade; validity; age in steps of 10 ms, 255 for 2.55 s and more."""
 
 VERSION = "Nisus"
 WRITTEN = f'VERSION "{VERSION}"'
 """Beginning of a DBC that Nisus wrote, and may write again."""
 
+GRADES = (*HEALTH_NAMES, WITHHELD)
+LARGEST = 3.4e38  # of a float32
 COUNTERS = 16
 MEAN, STD = "mean", "std"
 
@@ -159,23 +162,15 @@ def listened(engine: Running) -> dict[int, str]:
 
 def frames(first: int, message: StateMessage, counter: int) -> list[tuple[int, bytes]]:
     """Return identifier and content of the frames of a state message. Values that are not valid are 0."""
-    head = counter | HEALTH_NAMES.index(message.health) << 4
     age = min(255, int((message.age_s or 0.0) * 100.0))
     found = []
     for k, state in enumerate(message.states):
+        head = counter | GRADES.index(state.grade) << 4
         for offset, value in enumerate((state.value, state.std)):
-            identifier = first + 2 * k + offset
-            content = FRAME.pack(_single(value), head, _valid(state, value), age)
+            identifier, valid = first + 2 * k + offset, value is not None and abs(value) <= LARGEST
+            content = FRAME.pack(value if valid else 0.0, head, valid, age)
             found.append((identifier, content + bytes([checksum(identifier, content)])))
     return found
-
-
-def _single(value: float | None) -> float:
-    return 0.0 if value is None or abs(value) > 3.4e38 else value
-
-
-def _valid(state: PublishedState, value: float | None) -> int:
-    return int(state.valid and value is not None and abs(value) <= 3.4e38)
 
 
 def dbc_text(section: CanOutputSection, engine: Running) -> str:
@@ -185,7 +180,7 @@ def dbc_text(section: CanOutputSection, engine: Running) -> str:
 
     # Names in a DBC are those of C.
     name = re.sub(r"[^A-Za-z0-9_]|^(?=[0-9])", "_", engine.twin.name)
-    words = dict(enumerate(HEALTH_NAMES))
+    words = dict(enumerate(GRADES))
     messages = []
     for k, state in enumerate(engine.model.shown_states):
         for offset, part in enumerate((MEAN, STD)):
@@ -194,7 +189,7 @@ def dbc_text(section: CanOutputSection, engine: Running) -> str:
             signals = [
                 Signal(own, 0, 32, conversion=value, unit=state.unit),
                 Signal(f"{own}_counter", 32, 4),
-                Signal(f"{own}_health", 36, 4, conversion=BaseConversion.factory(1, 0, choices=words)),
+                Signal(f"{own}_grade", 36, 4, conversion=BaseConversion.factory(1, 0, choices=words)),
                 Signal(f"{own}_valid", 40, 1),
                 Signal(f"{own}_age", 48, 8, conversion=BaseConversion.factory(0.01, 0), unit="s"),
                 Signal(f"{own}_checksum", 56, 8),

@@ -150,7 +150,6 @@ class FleetRule:
             text += f" and {count - len(first):,} more" if count > len(first) else ""
         if (number := int(recovered.sum()) + len(gone)) and not self._removed:
             text += f"; {counted(number, 'asset')} recovered"
-        rest: dict[str, Any] = dict.fromkeys(("std", "limit", "probability"))
         return FleetAlertMessage(
             twin=self._fleet,
             id=self._id,
@@ -169,7 +168,6 @@ class FleetRule:
             assets=tuple(listed),
             fired=tuple(new),
             recovered=tuple(better),
-            **rest,
         )
 
 

@@ -14,7 +14,7 @@ from estimators.errors import ConfigError
 from sources.brokers import run_again
 
 from ..live.outputs import OutputLink
-from ..present.state_message import PublishedState, StateMessage
+from ..present.state_message import StateMessage
 from ..twin.secrets import Secrets
 
 if TYPE_CHECKING:
@@ -31,9 +31,10 @@ STATUS_CODES = {
     "suspect": "UncertainSubNormal",
     "degraded": "UncertainLastUsableValue",
     "diverged": "Bad",
+    "withheld": "Bad",
     "stale": "BadNoCommunication",
 }
-"""Status code of a state by the health of the twin; one that is withheld is Bad."""
+"""Status code of a state by its grade."""
 
 EPOCH = datetime(1970, 1, 1, tzinfo=UTC)
 RETRY_S, STOP_TIMEOUT_S = 5.0, 2.0
@@ -186,7 +187,7 @@ def values_of(message: StateMessage) -> dict[str, Any]:
 
     found: dict[str, Any] = {}
     for state in message.states:
-        code = status_code(message.health, state)
+        code = STATUS_CODES[state.grade]
         for path, value in (
             (state.name, state.value),
             (f"{state.name}.std", state.std),
@@ -201,9 +202,3 @@ def values_of(message: StateMessage) -> dict[str, Any]:
     ):
         found[path] = data(text, ua.VariantType.String, "Good")
     return found
-
-
-def status_code(health: str, state: PublishedState) -> str:
-    """Return the name of a state's status code."""
-    code = STATUS_CODES[health]
-    return "Bad" if not state.valid and not code.startswith("Bad") else code

@@ -4,12 +4,12 @@ from __future__ import annotations
 
 import numpy as np
 
-from estimators.diagnostics.references import HALF_WIDTH
+from estimators.diagnostics.references import HALF_WIDTH, WITHHELD, state_grades
 from estimators.fleet.table import FleetTable
 from estimators.track import HEALTH_NAMES
 
 from ..twin.twin import Twin
-from .state_message import PUBLISHED, StateMessage, calendar_time, iso_now, number_or_none, published_state
+from .state_message import StateMessage, calendar_time, iso_now, number_or_none, published_state
 
 
 class ChangedAssets:
@@ -57,17 +57,12 @@ def asset_message(twin: Twin, name: str, table: FleetTable, place: int) -> State
         place: Position of the asset.
     """
     model, health, cause = twin.model, int(table.health[place]), str(table.cause[place])
-    reason = "" if health in PUBLISHED else cause or f"the asset is {HEALTH_NAMES[health]}"
     seconds = float(table.seconds[place])
     t = round(seconds * 1e6) * 1000 if np.isfinite(seconds) else None
-    states = tuple(
-        published_state(
-            state, mean, std, reason or ("too uncertain" if std > state.withhold / HALF_WIDTH else "")
-        )
-        for state, mean, std in zip(
-            model.shown_states, table.mean[place].tolist(), table.std[place].tolist(), strict=True
-        )
-    )  # fmt: skip
+    numbers = [*zip(model.shown_states, table.mean[place].tolist(), table.std[place].tolist(), strict=True)]
+    own = {state.name: (WITHHELD, "too uncertain") for state, _, std in numbers if std > state.withhold / HALF_WIDTH}
+    grades = state_grades(model, own, health, cause)
+    states = tuple(published_state(state, mean, std, grades[state.name]) for state, mean, std in numbers)
     # Per degree of freedom only where each measurement has one.
     nis = float(table.nis_mean[place]) if model.ny == len(model.sensors) else np.nan
     return StateMessage(

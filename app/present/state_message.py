@@ -14,15 +14,17 @@ import numpy as np
 from pydantic import BaseModel, ConfigDict, Field, model_validator
 
 from estimators.diagnostics.detectors import CALENDAR_FROM_S, is_outside
+from estimators.diagnostics.references import state_grades
+from estimators.diagnostics.sensitivity import Bound
 from estimators.model.parts import State
-from estimators.track import DEGRADED, GATED, HEALTH_NAMES, MISSING, SUSPECT, USABLE, USED
+from estimators.track import DEGRADED, DIVERGED, GATED, HEALTH_NAMES, MISSING, SUSPECT, USABLE, USED
 
 from ..live.running_fold import Running
 
 SCHEMA: Literal["nisus.state/1"] = "nisus.state/1"
 
-PUBLISHED = (*USABLE, SUSPECT, DEGRADED)
-"""Health in which an estimate is published; in the others it is lost, outdated, or has not begun."""
+PUBLISHED = tuple(HEALTH_NAMES[code] for code in (*USABLE, SUSPECT, DEGRADED))
+"""Grades with which an estimate is published; with the others it is lost, outdated, withheld, or has not begun."""
 
 Name = Annotated[str, Field(min_length=1)]
 
@@ -32,7 +34,7 @@ class _Part(BaseModel):
 
 
 class PublishedState(_Part):
-    """Estimate of one state. Where it is not valid there is no number, and `reason` says why."""
+    """Estimate of one state. Where it is not valid there is no number; `reason` says why the grade is not tracking."""
 
     name: Name
     unit: str
@@ -41,14 +43,17 @@ class PublishedState(_Part):
     protection_level: Annotated[float, Field(ge=0.0)] | None = Field(
         description="bound of the error with 95 %, undetected faults included, in `unit`; null while it is not known"
     )
-    valid: bool
-    reason: str
+    valid: bool = Field(description="whether it has numbers; only those of tracking and advisory hold")
+    grade: Literal["waiting", "tracking", "advisory", "suspect", "degraded", "diverged", "stale", "withheld"]
+    reason: str = Field(description="why the grade is not tracking")
 
     @model_validator(mode="after")
     def _number_or_reason(self) -> PublishedState:
         numbers = self.value is not None and self.std is not None
-        if self.valid != numbers or self.valid == bool(self.reason):
-            raise ValueError("a valid state has value and std, and any other a reason")
+        if self.valid != numbers or self.valid != (self.grade in PUBLISHED):
+            raise ValueError(f"a state that is {', '.join(PUBLISHED)} is valid, with value and std, and no other")
+        if bool(self.reason) == (self.grade == "tracking"):
+            raise ValueError("a state has a reason unless it is tracking")
         return self
 
 
@@ -104,15 +109,13 @@ class StateMessage(_Part):
 def state_message(engine: Running, *, covariance: bool = False) -> StateMessage:
     """Return the present state of a running twin; with `covariance`, P of all states of the filter."""
     status, model = engine.latest(), engine.model
-    tuning = status.tuning
-    health = status.health
+    tuning, cause = status.tuning, status.cause
+    grades = state_grades(model, status.grades, status.health, cause)
     levels = {} if status.integrity is None else status.integrity.bounds
-    reason = "" if health in PUBLISHED else status.cause or f"the twin is {HEALTH_NAMES[health]}"
-    states = []
-    for state, mean, std in zip(model.shown_states, status.mean.tolist(), status.std.tolist(), strict=True):
-        level = levels.get(state.name)
-        why = reason or status.withheld.get(state.name, "")
-        states.append(published_state(state, mean, std, why, None if level is None else level.bound))
+    states = tuple(
+        published_state(state, mean, std, grades[state.name], levels.get(state.name))
+        for state, mean, std in zip(model.shown_states, status.mean.tolist(), status.std.tolist(), strict=True)
+    )
     inputs = [_input(item, float(value)) for item, value in zip(model.inputs, status.inputs, strict=True)]
     sensors = [
         PublishedSensor(
@@ -140,12 +143,12 @@ def state_message(engine: Running, *, covariance: bool = False) -> StateMessage:
         revision=status.revision,
         tuning=tuning.name or None,
         model_version=status.model_version,
-        health=HEALTH_NAMES[health],  # type: ignore[arg-type]
-        cause=status.cause,
+        health=HEALTH_NAMES[status.health],  # type: ignore[arg-type]
+        cause=cause,
         estimate_valid=valid,
         inputs_valid=all(item.valid for item in inputs),
         nis=number_or_none(status.nis.ratio),
-        states=tuple(states),
+        states=states,
         inputs=tuple(inputs),
         sensors=tuple(sensors),
         covariance=None if P is None else tuple(map(tuple, P.tolist())),
@@ -153,26 +156,30 @@ def state_message(engine: Running, *, covariance: bool = False) -> StateMessage:
     )
 
 
-def published_state(state: State, mean: float, std: float, reason: str, level: float | None = None) -> PublishedState:
+def published_state(
+    state: State, mean: float, std: float, graded: tuple[str, str], level: Bound | None = None
+) -> PublishedState:
     """Return one state of a message.
 
     Args:
         state: The state.
         mean: Its estimate.
         std: Its standard deviation.
-        reason: Why it is not valid, "" if nothing is known against it.
+        graded: Its grade and reason, of `state_grades`.
         level: Its protection level; None if it is not known.
     """
-    if not reason and not (math.isfinite(mean) and math.isfinite(std)):
-        reason = "the estimate is not a number"
+    if graded[0] in PUBLISHED and not (math.isfinite(mean) and math.isfinite(std)):
+        graded = HEALTH_NAMES[DIVERGED], "the estimate is not a number"
+    valid = graded[0] in PUBLISHED
     return PublishedState(
         name=state.name,
         unit=state.unit,
-        value=None if reason else mean,
-        std=None if reason else std,
-        protection_level=None if reason or level is None else number_or_none(level),
-        valid=not reason,
-        reason=reason,
+        value=mean if valid else None,
+        std=std if valid else None,
+        protection_level=number_or_none(level.bound) if valid and level is not None else None,
+        valid=valid,
+        grade=graded[0],  # type: ignore[arg-type]
+        reason=graded[1],
     )
 
 

@@ -72,11 +72,15 @@ class TwinCollector:
             labels = ["twin", "state", "unit"]
             mean = GaugeMetricFamily("nisus_state_mean", "Estimate of a valid state, in its unit.", labels=labels)
             std = GaugeMetricFamily("nisus_state_std", "Its standard deviation.", labels=labels)
+            grades = GaugeMetricFamily(
+                "nisus_state_grade", "1 for the present grade of a state.", labels=["twin", "state", "grade"]
+            )
             for state in message.states:
+                grades.add_metric([message.twin, state.name, state.grade], 1.0)
                 for family, value in ((mean, state.value), (std, state.std)):
                     if value is not None:
                         family.add_metric([message.twin, state.name, state.unit], value)
-            yield from (mean, std)
+            yield from (mean, std, grades)
 
     def _published(self, twin: str) -> Iterator[Metric]:
         """Yield metrics of outputs and receivers of alerts; of the ones that the twin has."""

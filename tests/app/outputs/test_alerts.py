@@ -31,10 +31,15 @@ from tests.waiting import LIMIT_S, wait_for
 BEGIN = 1_767_225_600 * SECOND
 
 
-def state(value=100.0, std=10.0, **fields):
+def state(value=100.0, std=10.0, grade="", **fields):
     """A message of one state."""
     given = {"name": "winding", "unit": "°C", "protection_level": None, "valid": value is not None}
-    one = PublishedState(**given, value=value, std=None if value is None else std, reason="" if value else "diverged")
+    given |= {
+        "value": value,
+        "std": None if value is None else std,
+        "grade": grade or ("tracking" if value else "stale"),
+    }
+    one = PublishedState(**given, reason="" if given["grade"] == "tracking" else "as it is")
     known = dict(twin="motor", estimator="kf", time_ns=1, time=None, sent="", age_s=0.1, revision=0, tuning=None)
     known |= dict(model_version=1, health="tracking", cause="", estimate_valid=True, inputs_valid=True, nis=1.0)
     known |= dict(states=(one,), inputs=(), sensors=(), covariance=None, covariance_of=None)

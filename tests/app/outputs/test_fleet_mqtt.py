@@ -120,7 +120,7 @@ def test_a_state_that_is_not_known_has_no_number():
     assert (stale.age_s, stale.time_ns, stale.time, stale.estimate_valid) == (60.0, SECOND, None, False)
     assert [item.value for item in good.states] == [0.0, 0.0] and good.estimate_valid
     assert (waiting.time_ns, waiting.age_s) == (None, None)
-    assert waiting.states[0].reason == "the asset is waiting"
+    assert waiting.states[0].reason == "the twin is waiting"
     wide = known._replace(std=np.array([[0.0, 0.0], [1.0, 1.1], [0.0, 0.0]]))
     limits = [replace(state, withhold=2.0) for state in twin.model.shown_states]  # of the half-width, 1.96 σ
     model = SimpleNamespace(shown_states=limits, sensors=twin.model.sensors, ny=1)

@@ -19,7 +19,6 @@ from app.twin.twin import load_twin
 from estimators import fold
 from estimators.errors import ConfigError
 from estimators.log import READING, Log
-from estimators.track import HEALTH_NAMES
 from sources.source import ignore
 from tests import ROOT
 from tests.app.outputs.broker import Broker, Listener
@@ -212,7 +211,7 @@ def test_the_same_state_from_every_output_whatever_the_source(serve, tmp_path, k
             return expected.items() <= signals.items()
 
         wait_for(received)
-        assert {str(signals[f"{name}_mean_health"]) for name in names} == {found["health"]}
+        assert {str(signals[f"{name}_mean_grade"]) for name in names} == {state["grade"] for state in found["states"]}
     finally:
         publisher.stop()
         hears.stop()
@@ -222,31 +221,22 @@ def test_the_same_state_from_every_output_whatever_the_source(serve, tmp_path, k
         broker.stop()
 
 
-@pytest.mark.parametrize("health", HEALTH_NAMES)
-def test_the_status_code_says_whether_a_value_may_be_used(health):
-    valid = health in ("tracking", "advisory", "suspect", "degraded")
-    found = values_of(state(100.0 if valid else None, health=health, estimate_valid=valid))
-    wanted = {
-        "waiting": "BadWaitingForInitialData", "tracking": "Good", "advisory": "Good", "diverged": "Bad",
-        "suspect": "UncertainSubNormal", "degraded": "UncertainLastUsableValue", "stale": "BadNoCommunication",
-    }[health]  # fmt: skip
-    assert {found[name].StatusCode.name for name in ("winding", "winding.std")} == {wanted}
-    assert (found["winding"].Value.Value is None) == (not valid)
+@cases(__file__, "status_codes.csv")
+def test_the_status_code_says_whether_a_state_may_be_used_whatever_the_twin(grade, value, code):
+    found = values_of(state(float(value) if value else None, grade=grade))
+    assert {found[name].StatusCode.name for name in ("winding", "winding.std")} == {code}
+    assert (found["winding"].Value.Value is None) == (not value)
     assert found["winding.protection_level"].Value.Value is None
-
-
-def test_a_withheld_state_is_bad_while_the_twin_is_good():
-    assert values_of(state(None))["winding"].StatusCode.name == "Bad"
 
 
 def test_frames_carry_validity_age_and_counter_and_a_checksum_that_is_the_standards():
     # The check value of CRC-8 SAE J1850 over "123456789" is 0x4B; here the identifier is its first four bytes.
     assert checksum(int.from_bytes(b"1234", "little"), b"56789") == 0x4B
-    (identifier, mean), (_, std) = frames(1536, state(100.0, age_s=0.5, health="suspect"), 7)
+    (identifier, mean), (_, std) = frames(1536, state(100.0, age_s=0.5, grade="suspect"), 7)
     assert (identifier, struct.unpack_from("<fBBB", mean)) == (1536, (100.0, 0x37, 1, 50))
     assert struct.unpack_from("<fBBB", std) == (10.0, 0x37, 1, 50)
-    (_, lost), _ = frames(1536, state(None, age_s=99.0, health="diverged"), 8)
-    assert struct.unpack_from("<fBBB", lost) == (0.0, 0x58, 0, 255)
+    (_, lost), _ = frames(1536, state(None, age_s=99.0, grade="withheld"), 8)
+    assert struct.unpack_from("<fBBB", lost) == (0.0, 0x78, 0, 255)
 
 
 @pytest.mark.parametrize(("name", "word"), [("ü", "_"), ("3-pump", "_3_pump"), ("fan", "fan")])

@@ -18,7 +18,7 @@ from starlette.routing import Route
 from app.present.state_message import PublishedState, StateMessage, _input, state_message, state_schema
 from app.web.http import ApiRoute
 from estimators import Input, fuse
-from estimators.track import DEGRADED, DIVERGED, STALE, SUSPECT, WAITING
+from estimators.track import DEGRADED, DIVERGED, HEALTH_NAMES, STALE, SUSPECT, TRACKING, WAITING
 from tests.app.scripted import pull_all, readings
 from tests.cases import cases
 from tests.support import SECOND
@@ -105,7 +105,7 @@ def test_a_state_whose_mean_or_deviation_is_no_number_is_not_valid(page, wrong, 
     column[0] = value
     found = changed(page, t=5 * SECOND, **{wrong: column})
     first, *others = found.states
-    assert (first.value, first.std, first.valid, first.reason) == (None, None, False, "the estimate is not a number")
+    assert (first.value, first.grade, first.reason) == (None, "diverged", "the estimate is not a number")
     assert all(item.valid for item in others) and not found.estimate_valid and found.covariance is None
     assert "NaN" not in found.model_dump_json() and "Infinity" not in found.model_dump_json()
 
@@ -116,13 +116,16 @@ def test_a_state_whose_mean_or_deviation_is_no_number_is_not_valid(page, wrong, 
 def test_health_decides_whether_an_estimate_is_published(page, health, valid):
     found = changed(page, t=5 * SECOND, health=health, cause="its cause")
     assert {item.valid for item in found.states} == {valid} and found.estimate_valid == valid
-    assert {item.reason for item in found.states} == {"" if valid else "its cause"}
+    assert {(item.grade, item.reason) for item in found.states} == {(HEALTH_NAMES[health], "its cause")}
 
 
-def test_a_withheld_state_has_its_reason(page):
-    name = page.engine.model.shown_states[0].name
-    first = changed(page, t=5 * SECOND, grades={name: ("withheld", "too uncertain, ± 3 °C")}).states[0]
-    assert (first.name, first.value, first.valid, first.reason) == (name, None, False, "too uncertain, ± 3 °C")
+@pytest.mark.parametrize(("grade", "valid"), [("withheld", False), ("suspect", True)])
+@pytest.mark.parametrize("health", [TRACKING, SUSPECT])
+def test_a_state_that_is_worse_by_itself_says_so_and_the_others_are_as_the_twin(page, grade, valid, health):
+    names = [state.name for state in page.engine.model.shown_states]
+    found = changed(page, t=5 * SECOND, health=health, cause="stuck", grades={names[0]: (grade, "its own")}).states
+    told = [(item.grade, item.valid, item.reason) for item in found]
+    assert told == [(grade, valid, "its own"), (HEALTH_NAMES[health], True, "stuck" * (health == SUSPECT))]
 
 
 def test_a_time_of_the_calendar_is_written_as_such(page):
@@ -177,6 +180,7 @@ def test_metrics_are_those_of_the_message(page):
     labels = ("state", first["name"]), twin, ("unit", first["unit"])
     found = samples("?states=true")
     assert (found["nisus_state_mean", *labels], found["nisus_state_std", *labels]) == (first["value"], first["std"])
+    assert found["nisus_state_grade", ("grade", first["grade"]), *labels[:2]] == 1.0
 
 
 def test_problems_are_counted_by_kind_and_the_dashboard_asks_for_what_there_is(page):
