@@ -9,6 +9,7 @@ so that a model function that never returns does not block the interpreter.
 from __future__ import annotations
 
 from collections.abc import Sequence
+from typing import Any
 
 import numpy as np
 
@@ -414,6 +415,13 @@ class Fold:
         self.decisions = [decision for decision in self.decisions if decision.row >= self.log.first + count]
 
 
+def folded(estimator: str, model: StateSpaceModel, tuning: Tuning, log: Log, **options: Any) -> Fold:
+    """Return a fold that has reached the end of its log; for the options see `Fold`."""
+    whole = Fold(estimator, model, tuning, log, **options)
+    whole.advance()
+    return whole
+
+
 def fold(
     estimator: str,
     model: StateSpaceModel,
@@ -433,8 +441,7 @@ def fold(
         EstimatorError: If the estimator does not exist or does not apply to the model.
         ModelError: If the model's functions contradict its declaration, or those of a black box fail.
     """
-    growing = Fold(estimator, model, tuning, log, pairs=pairs, policy=policy, prior=prior)
-    growing.advance()
-    if growing.failure is not None:
-        raise growing.failure
-    return growing.track
+    whole = folded(estimator, model, tuning, log, pairs=pairs, policy=policy, prior=prior)
+    if whole.failure is not None:
+        raise whole.failure
+    return whole.track

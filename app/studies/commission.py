@@ -13,7 +13,7 @@ from config.loader import TWINS
 from estimators.diagnostics.episodes.baseline import Normal, commission, contradictions
 from estimators.diagnostics.score import score
 from estimators.errors import ConfigError
-from estimators.fold import Fold
+from estimators.fold import Fold, folded
 from estimators.track import DIVERGED, FAILED, GATED, SCREENED, STALE
 from estimators.tuning import CHANGED_MARK
 
@@ -72,8 +72,7 @@ def commission_running(engine: Running, *, force: bool) -> Path:
     if tuning.name.endswith(CHANGED_MARK):
         raise ConfigError(f"{twin.name}: its tuning has been edited; save it first, or undo the edits")
     log, base = copy_log(engine, tuning)
-    fold = Fold(estimator, engine.model, replace(tuning, baseline=None), log, policy=engine.policy, base=base)
-    fold.advance()
+    fold = folded(estimator, engine.model, replace(tuning, baseline=None), log, policy=engine.policy, base=base)
     normals = baseline_of(fold, twin.name, force=force, option="Store anyway")
     write_section(section_file(twin), "commissioned", lines(normals))
     return section_file(twin)

@@ -31,7 +31,7 @@ from ..diagnostics.health import HealthPolicy
 from ..diagnostics.references import held_out_references, references
 from ..diagnostics.score import log_density
 from ..errors import EstimatorError, nearest, quoted
-from ..fold import Fold
+from ..fold import folded
 from ..log import READING, Log
 from ..track import FAILED, GATED, USED, Track
 from .entries import Setting
@@ -186,11 +186,8 @@ def track_of(estimator: str, setting: Setting, recording: Recording, without: in
     tuning, prior = setting
     if without is not None:
         tuning = tuning.set(f"use.{tuning.model.sensor_names[without]}", False)
-    fold = Fold(
-        estimator, tuning.model, tuning, recording.log, base=recording.base, prior=prior, policy=HealthPolicy(window=0)
-    )
-    fold.advance()
-    return fold.track
+    policy = HealthPolicy(window=0)
+    return folded(estimator, tuning.model, tuning, recording.log, base=recording.base, prior=prior, policy=policy).track
 
 
 def sensors_in_turn(setting: Setting, recordings: list[Recording]) -> list[int]:

@@ -119,9 +119,7 @@ class FitVerdict(NamedTuple):
     harmless: bool = False
 
 
-def worths(
-    estimator: str, settings: Sequence[Setting], recordings: Sequence[Recording], go: Go, aim: Aim | None = None
-) -> list[Worth]:
+def worths(estimator: str, settings: Sequence[Setting], recordings: Sequence[Recording], go: Go) -> list[Worth]:
     """Return the scores of each setting.
 
     Args:
@@ -129,13 +127,12 @@ def worths(
         settings: Tunings and priors.
         recordings: With the truth, where it is known.
         go: Callback, see `Go`.
-        aim: Aim of the fit; None for the likelihood.
 
     Raises:
         Cancelled: If `go` returns False.
     """
     given = tuple(settings), tuple(recordings)
-    found = worths_in_use(estimator, *given, go, aim)
+    found = worths_in_use(estimator, *given, go, Aim())
     return with_sensors(estimator, *given, found, range(len(found)), go)
 
 
@@ -144,11 +141,11 @@ def worths_in_use(
     settings: tuple[Setting, ...],
     recordings: tuple[Recording, ...],
     go: Go,
-    aim: Aim | None = None,
+    aim: Aim,
     executor: Executor | str | None = "threads",
 ) -> list[Worth]:
     """Return the same without the sensors held out in turn, a fold of each recording."""
-    work = partial(_in_use, estimator, settings, recordings, aim or Aim())
+    work = partial(_in_use, estimator, settings, recordings, aim)
     folds, model = len(recordings), settings[0].tuning.model
     return each_folded(work, range(len(settings)), folds, estimator, model, executor=executor, go=go)
 

@@ -14,7 +14,7 @@ from typing import NamedTuple
 import numpy as np
 
 from ..diagnostics.detectors import STUCK
-from ..fold import Fold
+from ..fold import folded
 from ..log import INPUT, MAINTENANCE, READING, RESET, TRUTH, Log
 from ..snapshots import Base
 from ..tuning import Tuning
@@ -102,8 +102,7 @@ def without_stuck(estimator: str, tuning: Tuning, log: Log, base: Base | None = 
         if not stuck.any():
             continue
         if fold is None:
-            fold = Fold(estimator, model, replace(tuning, baseline=None), log, base=base)
-            fold.advance()
+            fold = folded(estimator, model, replace(tuning, baseline=None), log, base=base)
         alarms = (fold.track.alarms[own, : len(sensor.rows)] & STUCK != 0).any(axis=1)
         run = np.cumsum(np.diff(stuck.astype(np.int8), prepend=0) == 1) * stuck
         stuck &= np.isin(run, run[alarms & stuck])

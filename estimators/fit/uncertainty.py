@@ -162,7 +162,7 @@ def _inverse(H: np.ndarray) -> np.ndarray | None:
     if not np.all(np.isfinite(H)) or np.any(np.diag(H) <= 0.0):
         return None
     root = np.sqrt(np.diag(H))
-    values, vectors = np.linalg.eigh(H / np.outer(root, root))
+    values, vectors = np.linalg.eigh(_scaled(H))
     if values[0] <= MIN_CURVATURE * values[-1]:
         return None
     return (vectors / values) @ vectors.T / np.outer(root, root)
@@ -275,7 +275,7 @@ def parameter_widths(
     recordings: Sequence[Recording],
     prior: Mapping[str, float],
     *,
-    aim: Aim | None = None,
+    aim: Aim,
     go: Go = lambda folds: True,
     executor: Executor | str | None = "threads",
 ) -> ParameterWidths:
@@ -293,7 +293,6 @@ def parameter_widths(
     Raises:
         Cancelled: If `go` returns False.
     """
-    aim = aim or Aim()
     model, names = setting.tuning.model, tuple(prior)
     known = {item.name: item for item in model.parameters}
     D = np.array([prior[name] for name in names])

@@ -29,7 +29,7 @@ from ..diagnostics.episodes import Episode, JudgedRows, episodes_of
 from ..diagnostics.health import HealthPolicy
 from ..diagnostics.score import Score, score
 from ..errors import ConfigError, EstimatorError
-from ..fold import Fold
+from ..fold import Fold, folded
 from ..fold import fold as fold_track
 from ..log import Events, Log
 from ..model.state_space import StateSpaceModel
@@ -102,9 +102,8 @@ def fold(
     pairs = all_pairs(model) if covariance else None
     if smoothed:
         check_smooth(find_estimator(estimator, model), model, tuned.options)
-        folded = Fold(estimator, model, tuned, log, pairs=pairs, policy=policy, prior=prior)
-        folded.advance()
-        track = smooth(folded).instead_of(folded.track)
+        whole = folded(estimator, model, tuned, log, pairs=pairs, policy=policy, prior=prior)
+        track = smooth(whole).instead_of(whole.track)
     else:
         track = fold_track(estimator, model, tuned, log, pairs=pairs, policy=policy, prior=prior)
     return Estimates(estimator, model, tuned, log.events.copy(), track, covariance)

@@ -20,7 +20,7 @@ import numpy as np
 from config.schema import RefitSection
 from config.tunings import version_files
 from estimators.errors import ConfigError, NisusError
-from estimators.fold import Fold
+from estimators.fold import folded
 from estimators.log import Log
 from estimators.snapshots import Base
 from estimators.tuning import Tuning
@@ -179,9 +179,8 @@ class Fitting:
         if since is None:
             return log, base
         # A copy starts at a snapshot, which may be long before.
-        fold = Fold(attempt.estimator, attempt.tuning.model, attempt.tuning, log, base=base)
-        fold.advance()
-        return tail(fold, int(np.searchsorted(log.t[: log.n], since)), base)
+        fold = folded(attempt.estimator, attempt.tuning.model, attempt.tuning, log, base=base)
+        return tail(fold, int(np.searchsorted(log.events.t, since)), base)
 
 
 @dataclass(frozen=True)

@@ -20,7 +20,7 @@ from estimators.errors import ModelError, NisusError
 from estimators.fit.entries import entries_of
 from estimators.fit.objective import Cancelled, Objective, scaled_rounds
 from estimators.fit.recording import Recording, without_queries
-from estimators.fold import Fold
+from estimators.fold import Fold, folded
 from estimators.log import Log
 from estimators.model.coloured import ColouredError, coloured, disturbance_time, error_time, errors_of
 from estimators.model.state_space import StateSpaceModel
@@ -156,8 +156,8 @@ def _candidates(model: StateSpaceModel, estimator: str, trial: _Trial, row: Cali
         if noise.name in done or not _can(model, Appended(noise.name, None, over)):
             continue
         key = f"Q.{noise.name}"
-        other = Fold(estimator, fold.model, trial.tuning.set(key, 4.0 * float(trial.tuning.get(key) or 0.0)), fold.log)
-        other.advance()
+        louder = trial.tuning.set(key, 4.0 * float(trial.tuning.get(key) or 0.0))
+        other = folded(estimator, fold.model, louder, fold.log)
         if np.nanstd(other.track.innovation[rows, column] - innovation) > MIN_EFFECT * np.nanstd(innovation):
             yield Appended(noise.name, None, over)
     sensor = model.sensors[k]
@@ -203,8 +203,7 @@ def _tried(
         )
         x, _ = scaled_rounds(objective, objective.start, rounds=1)
         tuning = objective.setting(x).tuning
-        fold = Fold(estimator, larger, tuning, whole)
-        fold.advance()
+        fold = folded(estimator, larger, tuning, whole)
     except (NisusError, Cancelled):
         return None
     return None if fold.failure is not None else _Trial(appended, tuning, fold, _likelihood(fold))

@@ -13,7 +13,7 @@ import numpy as np
 from estimators.diagnostics.consistency import NisVerdict
 from estimators.diagnostics.intervals import correlation_interval, share_interval
 from estimators.diagnostics.score import MAX_NIS_FACTOR, nis_verdict
-from estimators.fold import Fold
+from estimators.fold import Fold, folded
 from estimators.log import READING, Log
 from estimators.model.coloured import ColouredError, coloured
 from estimators.model.state_space import StateSpaceModel
@@ -142,7 +142,7 @@ class DraftFold:
     @property
     def _fitted(self) -> np.ndarray:
         """Mask of the events in fitted parts."""
-        return self._split.fitted(self._log.t[: self._log.n] + self._zero)
+        return self._split.fitted(self._log.events.t + self._zero)
 
     @property
     def memory(self) -> float:
@@ -150,8 +150,7 @@ class DraftFold:
         return float(self.drafted.options.get("memory", np.inf))
 
     def _folded(self, tuning: Tuning) -> Fold:
-        fold = Fold("kf", tuning.model, tuning, self._log.copy())
-        fold.advance()
+        fold = folded("kf", tuning.model, tuning, self._log.copy())
         if fold.failure is not None:
             raise fold.failure
         return fold
@@ -159,7 +158,7 @@ class DraftFold:
     def _rows(self, k: int, *, fitted: bool = False) -> np.ndarray:
         """Return the mask of the measurements of sensor k in the checked parts, or the fitted ones."""
         log = self._log
-        mask: np.ndarray = (log.kind[: log.n] == READING) & (log.channel[: log.n] == k) & (self._fitted == fitted)
+        mask: np.ndarray = (log.events.kind == READING) & (log.events.channel == k) & (self._fitted == fitted)
         return mask
 
     def _innovations(self, fold: Fold, k: int, *, fitted: bool = False) -> np.ndarray:

@@ -23,7 +23,7 @@ import numpy as np
 from estimators.compiled.context import SLACK
 from estimators.errors import ConfigError, EstimatorError, ModelError
 from estimators.estimator import Options
-from estimators.fold import Fold
+from estimators.fold import folded
 from estimators.gaussian import kf_steady
 from estimators.gaussian.robust import OWN
 from estimators.log import BEFORE, INPUT, MARK, READING, TICK, TRUTH, Log
@@ -409,8 +409,7 @@ def _vectors(
     Columns: the sensor (see also INPUTS_KIND), seconds since the last row, readings or inputs, variances of the
     readings (0: as tuned), verdict, NIS (NaN if it is not compared), means, standard deviations.
     """
-    fold = Fold(estimator, model, tuning, log)
-    fold.advance()
+    fold = folded(estimator, model, tuning, log)
     track, every = fold.track, log.events
     decided = min((item.row for item in fold.decisions), default=fold.n)
     ny = max(len(model.sensors[k].rows) for k in np.flatnonzero(tuning.used))

@@ -6,7 +6,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from ...fold import Fold
+from ...fold import Fold, folded
 from ...log import READING, Log
 from ...model.state_space import LARGE, StateSpaceModel
 from ...numerics.linalg import wrapped
@@ -183,13 +183,7 @@ def linearity(model: StateSpaceModel, tuning: Tuning, log: Log) -> Linearity:
     if reason:
         return Linearity(reason, model.linear, None, False, (), (), (), reason)
     plain = tuning.with_options({})
-
-    def run(name: str) -> Fold:
-        fold = Fold(name, model, plain, log)
-        fold.advance()
-        return fold
-
-    straight, curved = each(run, (LINEARISED, UNSCENTED), "threads")
+    straight, curved = each(lambda name: folded(name, model, plain, log), (LINEARISED, UNSCENTED), "threads")
     states = _states(straight, curved)
     rows, whiteness = _rows(straight, curved)
     passes = all(item.most <= LIMITS.bias for item in (*states, *rows))

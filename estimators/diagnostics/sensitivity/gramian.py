@@ -118,7 +118,6 @@ def gramian(
     *,
     base: Base | None = None,
     windows: int = 8,
-    most: int | None = None,
     executor: Executor | str | None = "threads",
 ) -> Gramian:
     """Nudge the prior mean of each state, and compute the information of a log about it.
@@ -130,7 +129,6 @@ def gramian(
         log: The events; it must not grow meanwhile (give a copy).
         base: Where the log starts, if older events were dropped.
         windows: Parts of equal time, or 0. Each begins at the estimate of that time with the covariance of the prior.
-        most: Number of events to refold, from the end; None for at most seconds.
         executor: As `sensitivity`.
 
     Raises:
@@ -145,7 +143,7 @@ def gramian(
         tuning = tuning.with_options({})
     fold = Fold(name, model, tuning, log, base=base)
     t = log.events.t
-    begin = max(0, log.n - (most or max_events(model, 2 * model.nx)))
+    begin = max(0, log.n - max_events(model, 2 * model.nx))
     cuts = np.searchsorted(t, np.linspace(t[begin], t[-1], windows + 1)[1:-1])
     begins = [begin, *(int(k) for k in cuts)]
     bases = []

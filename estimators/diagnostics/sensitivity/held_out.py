@@ -7,7 +7,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from ...fold import Fold
+from ...fold import Fold, folded
 from ...log import READING, Log
 from ...model.state_space import StateSpaceModel
 from ...registry import find_estimator
@@ -91,8 +91,7 @@ def held_out(estimator: str, model: StateSpaceModel, tuning: Tuning, log: Log) -
     without = [tuning.set(f"use.{model.sensor_names[s]}", False) for s in reporting]
 
     def run(other: Tuning) -> Fold:
-        fold = Fold(estimator, model, other, log)
-        fold.advance()
+        fold = folded(estimator, model, other, log)
         fold.finish()
         return fold
 

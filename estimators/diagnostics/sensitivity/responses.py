@@ -12,7 +12,7 @@ import numba
 import numpy as np
 
 from ...errors import digits as digits
-from ...fold import Fold
+from ...fold import folded
 from ...log import INPUT, READING, Log
 from ...model.state_space import StateSpaceModel
 from ...numerics.linalg import wrapped
@@ -190,9 +190,7 @@ def _at(t: np.ndarray, times: np.ndarray, values: np.ndarray) -> np.ndarray:
 
 
 def _track(estimator: str, tuning: Tuning, log: Log, base: Base) -> Track:
-    fold = Fold(estimator, tuning.model, tuning, log, base=base)
-    fold.advance()
-    return fold.track
+    return folded(estimator, tuning.model, tuning, log, base=base).track
 
 
 def stand_in(estimator: str, model: StateSpaceModel) -> tuple[str, str]:
@@ -251,8 +249,7 @@ def start(
         log.n = min(log.n, most)
     if name != estimator:
         tuning = tuning.with_options({})
-    fold = Fold(name, model, tuning, log, base=base)
-    fold.advance()
+    fold = folded(name, model, tuning, log, base=base)
     at, base = fold.base_at(max(0, log.n - most))
     still = log.copy()
     refused = (still.kind == READING) & ~np.isin(fold.track.verdict, (USED, NONE, MISSING))
@@ -411,7 +408,7 @@ class Nudge(NamedTuple):
 
 
 def nudges_of(
-    model: StateSpaceModel, tuning: Tuning, log: Log, kinds: Sequence[str] = KINDS, track: Track | None = None
+    model: StateSpaceModel, tuning: Tuning, log: Log, kinds: Sequence[str], track: Track | None = None
 ) -> list[Nudge]:
     """Return all nudges of a model, those of `KINDS` first: rows of used sensors with measurements, inputs, parameters.
 

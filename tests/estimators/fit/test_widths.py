@@ -62,7 +62,7 @@ def recorded(phi, seed=0, hidden=False, drive=None, gain=2.0):
 
 def widths(logs, gain, aim=None):
     setting = Setting(Tuning.of(MODEL).set("p.gain", gain), None)
-    return parameter_widths("ekf", setting, [Recording(log) for log in np.atleast_1d(logs)], PRIOR, aim=aim)
+    return parameter_widths("ekf", setting, [Recording(log) for log in np.atleast_1d(logs)], PRIOR, aim=aim or Aim())
 
 
 # The minimum has the variance (uᵀ u)⁻¹ uᵀ Σ u (uᵀ u)⁻¹. Its estimate is a quadratic form of 8 to 50 batches, of which
