@@ -163,9 +163,7 @@ def _column(model: StateSpaceModel, name: str) -> int:
 
 def _future(model: StateSpaceModel, base: Base, instants: np.ndarray, inputs: Events | None) -> Log:
     """Return a log with an event at each instant, which predicts the state to it, and the events of inputs."""
-    n = instants.size
-    nothing = np.full((n, model.width), np.nan)
-    steps = Events(instants, instants, np.full(n, INPUT, np.int8), np.zeros(n, np.int32), nothing)
+    steps = Events.alike(INPUT, instants, np.full((instants.size, model.width), np.nan))
     return Log.resume(model, base, steps if inputs is None else Events.concat([steps, inputs], model.width))
 
 

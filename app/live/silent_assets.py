@@ -7,7 +7,8 @@ from itertools import groupby
 import numpy as np
 
 from estimators.fleet.fleet import Fleet
-from estimators.log import TICK, Events
+
+from ..ingest import queries
 
 LENGTH_BYTES = 8
 
@@ -37,9 +38,7 @@ class SilentAssets:
                 self._states[place] = self._fleet.state(slice(place, place + 1))
             else:
                 self._fleet.restore(place, known)
-        none = np.zeros(places.size, np.int32)
-        missing = np.full((places.size, self._fleet.model.width), np.nan)
-        self._fleet.add_events(places, Events(times, times, np.full(places.size, TICK, np.int8), none, missing))
+        self._fleet.add_events(places, queries(times, self._fleet.model.width))
         self._fleet.advance()
 
     def forget(self, place: int, state: bytes) -> None:

@@ -94,8 +94,7 @@ def ticks(width: int, seconds: Any) -> Events:
 
 def blank(t: np.ndarray, kind: int, channel: int, width: int) -> Events:
     """Return events with values of NaN, which arrive when they are measured."""
-    n = t.size
-    return Events(t, t.copy(), np.full(n, kind, np.int8), np.full(n, channel, np.int32), np.full((n, width), np.nan))
+    return Events.alike(kind, t, np.full((t.size, width), np.nan), channel)
 
 
 def _numbers(name: str, values: Any) -> np.ndarray:

@@ -66,6 +66,12 @@ class Events(NamedTuple):
         return Events._make([*(np.array([_whole(name, number)], wanted) for (name, wanted), number in numbers), row])
 
     @staticmethod
+    def alike(kind: int, t: np.ndarray, value: np.ndarray, channel: int | np.ndarray = 0) -> Events:
+        """Return events of one kind at times t (n,), which arrive then; `value` is (n, width), or one column (n,)."""
+        kinds, channels = np.full(t.size, kind, np.int8), np.full(t.size, channel, np.int32)
+        return Events(t, t.copy(), kinds, channels, value[:, None] if value.ndim == 1 else value)
+
+    @staticmethod
     def concat(batches: list[Events], width: int) -> Events:
         """Concatenate batches, with at least `width` value columns."""
         if not batches:

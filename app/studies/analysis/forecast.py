@@ -294,9 +294,8 @@ def input_events(inputs: Mapping[str, Changes], now: int, model: StateSpaceModel
     """Return the changes of the inputs as events."""
     batch = []
     for name, changes in inputs.items():
-        n = len(changes)
         t = np.array([now + round(seconds * 1e9) for seconds, _ in changes], np.int64)
-        rows = np.full((n, model.width), np.nan)
+        rows = np.full((t.size, model.width), np.nan)
         rows[:, model.input_names.index(name)] = [value for _, value in changes]
-        batch.append(Events(t, t.copy(), np.full(n, INPUT, np.int8), np.zeros(n, np.int32), rows))
+        batch.append(Events.alike(INPUT, t, rows))
     return Events.concat(batch, model.width) if batch else None
