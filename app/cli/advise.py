@@ -100,7 +100,7 @@ def _of_twin(arguments: Arguments, name: str) -> int:
 def _topics(twin: Twin, log: Log, advice: Advice) -> list[Topic]:
     """Return the recommendation, the claims in the order of the tree, the lines for the YAML, and other remedies."""
     seconds = log.events.seconds
-    readings = int((log.kind[: log.n] == READING).sum())
+    readings = int((log.events.kind == READING).sum())
     same = "as now" if advice.estimator == twin.estimator else f"now {twin.estimator}"
     title = advice.title if advice.title.startswith(("Kalman", "Rao")) else advice.title[0].lower() + advice.title[1:]
     claims = []

@@ -136,7 +136,7 @@ def _reading_rate(twin: Twin) -> float:
     times = np.zeros(0)
     for seconds in SAMPLE_S:
         log, _ = attend(twin.model, partial(read_log, twin, seconds), "reading the source")
-        times = log.t[: log.n][log.kind[: log.n] == READING]
+        times = log.events.t[log.events.kind == READING]
         if times.size > MIN_SAMPLE:
             break
     return float((times.size - 1) / (times[-1] - times[0]) * 1e9) if times.size > 1 and times[-1] > times[0] else 0.0

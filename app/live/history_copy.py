@@ -45,7 +45,7 @@ def copy_log(
         pieces.append(pull.events)
     events = Events.concat(pieces, engine.model.width)
     log = Log.resume(engine.model, base, events)
-    if not (log.kind[: log.n] == READING).any():
+    if not (log.events.kind == READING).any():
         raise ConfigError("no reading has come yet; there is nothing to fold")
     return log, base
 

@@ -505,7 +505,7 @@ class Running(ABC):
         if first < shown:
             self._fold.rewind(first)
             self._row_counts.changed(first)
-            again = int(np.searchsorted(self._log.t[: self._log.n], newest, side="right"))
+            again = int(np.searchsorted(self._log.events.t, newest, side="right"))
             self._fold.advance(again - self._fold.n)
         self._batches.advance(self._fold)
         return min(first, shown), stale

@@ -221,7 +221,7 @@ def _quantile(freedom: int) -> float:
 
 def fingerprint(log: Log) -> tuple[int, float]:
     """Return the number of events and the sum of the sizes of their values, alike on any processor."""
-    return log.n, float(np.nansum(np.abs(log.value[: log.n])))
+    return log.n, float(np.nansum(np.abs(log.events.value)))
 
 
 def read_baseline(path: Path) -> ReferenceSection | None:

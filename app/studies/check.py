@@ -105,7 +105,7 @@ def check(twin: Twin, log: Log, counts: Counter[str], *, executor: Executor | st
         NisusError: If the twin's own filter does not run.
     """
     model, tuning = twin.model, twin.tuning
-    reporting = np.unique(log.channel[: log.n][log.kind[: log.n] == READING]).size
+    reporting = np.unique(log.events.channel[log.events.kind == READING]).size
     fold, seconds = timed(twin, twin.estimator, log.events, tuning.seed, BUDGET_S / (reporting + 2))
     span = None
     if fold.n < log.n:
@@ -113,7 +113,7 @@ def check(twin: Twin, log: Log, counts: Counter[str], *, executor: Executor | st
         log.n = fold.log.n = fold.n
     fold.finish()
     measured = Measured(twin, log, executor=executor)
-    readings = int(np.sum(log.kind[: log.n] == READING))
+    readings = int(np.sum(log.events.kind == READING))
     covariance = not fold.estimator.samples
     present, *onsets = sensitivities(
         twin.estimator, model, tuning, log, false_alarm=twin.policy.false_alarm_every, executor=executor

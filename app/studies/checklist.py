@@ -192,7 +192,7 @@ def _tuning(checked: Checked) -> Answer:
 
 def _change(checked: Checked) -> Answer:
     log = checked.log
-    count = int(np.sum(log.kind[: log.n] == MAINTENANCE))
+    count = int(np.sum(log.events.kind == MAINTENANCE))
     figures = f"each maintenance increases the version of {checked.twin.model.name}; {count} in this log"
     if count:
         return YES, figures, ""

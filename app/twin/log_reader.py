@@ -95,7 +95,7 @@ def read_log(twin: Twin, duration: float | None, *, blind: bool = False) -> tupl
         while (batch := source.read(1.0)) is not None:
             put(intake.take(batch))
             if duration is not None and log.n and log.t[log.n - 1] - log.t[0] > duration * 1e9:
-                log.n = int(np.searchsorted(log.t[: log.n], log.t[0] + round(duration * 1e9), side="right"))
+                log.n = int(np.searchsorted(log.events.t, log.t[0] + round(duration * 1e9), side="right"))
                 break
         else:
             put(intake.finish())

@@ -15,7 +15,6 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from estimators.diagnostics.field_pictures import Picture
-from estimators.fold import Fold
 from estimators.log import Events, Log
 from estimators.model.state_space import StateSpaceModel
 from estimators.track import Track
@@ -48,11 +47,11 @@ def picture_of(twin: Any, log: Log) -> str:
         NisusError: If the fold fails, or Matplotlib is not installed.
     """
     model, scene, window = twin.model, twin.config.view.scene, twin.config.view.window
-    fold = Fold(twin.estimator, model, twin.tuning, log, pairs=twin.pairs, picture=twin.picture)
+    fold = twin.fold(log, pairs=twin.pairs, picture=twin.picture)
     cloud = np.zeros((0, model.nx))
     if scene.kind == "vehicle":
         # A quarter into the window the vehicle may still be at several places.
-        fold.advance(int(np.searchsorted(log.t[: log.n], log.t[0] + round(0.25e9 * window))))
+        fold.advance(int(np.searchsorted(log.events.t, log.t[0] + round(0.25e9 * window))))
         if fold.estimator.peaks is not None:
             points = np.asarray(fold.points())
             cloud = points[:: max(1, len(points) // MAX_CLOUD_POINTS)]

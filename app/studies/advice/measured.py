@@ -60,7 +60,7 @@ def without_faults(twin: Twin, log: Log, known: Sequence[Episode] | None = None)
     """
     if known is None:
         known = episodes(Measured(twin, log).folded(twin.estimator).fold)
-    t, clean = log.t[: log.n] * 1e-9, log.copy()
+    t, clean = log.events.t * 1e-9, log.copy()
     found: list[Exclusion] = []
     for sensor, row, column, readings in sensor_rows(twin.model, log.events):
         left_out, listed = np.zeros(log.n, bool), []
@@ -82,7 +82,7 @@ def without_faults(twin: Twin, log: Log, known: Sequence[Episode] | None = None)
 def repeats_of(model: StateSpaceModel, log: Log) -> dict[str, Finding]:
     """Return how the measurements of each sensor row repeat."""
     return {
-        row: find_repeats(log.t[: log.n][known], log.value[: log.n, column][known])
+        row: find_repeats(log.events.t[known], log.events.value[:, column][known])
         for _, row, column, known in sensor_rows(model, log.events)
         if known.any()
     }
@@ -131,7 +131,7 @@ class Measured:
     @cached_property
     def rate(self) -> float:
         """Readings per second over the log."""
-        times = self.log.t[: self.log.n][self.log.kind[: self.log.n] == READING]
+        times = self.log.events.t[self.log.events.kind == READING]
         span = float(times[-1] - times[0]) * 1e-9 if times.size else 0.0
         return (times.size - 1) / span if span > 0.0 else 0.0
 

@@ -281,9 +281,9 @@ def steady(measured: Measured) -> tuple[Claim, float]:
     against = unfit(find_entry(STEADY), model)
     if against:
         return REGULAR.claim(NO, None, f"{STEADY} does not apply: {against}"), 0.0
-    value = log.value[: log.n, : len(model.sensors[0].rows)]
-    complete = (log.kind[: log.n] == READING) & np.isfinite(value).all(axis=1)
-    intervals = np.diff(log.t[: log.n][complete]) * 1e-9
+    value = log.events.value[:, : len(model.sensors[0].rows)]
+    complete = (log.events.kind == READING) & np.isfinite(value).all(axis=1)
+    intervals = np.diff(log.events.t[complete]) * 1e-9
     if not intervals.size:
         return REGULAR.claim(UNTOLD, None, "the log has one reading"), 0.0
     period = float(np.median(intervals))

@@ -193,7 +193,7 @@ def _seen(bench: Bench, clean: Fold, wrong: Fold, mistake: Mistake) -> tuple[boo
 
 
 def _readings(fold: Fold) -> np.ndarray:
-    return np.flatnonzero(fold.log.kind[: fold.n] == READING)
+    return np.flatnonzero(fold.events.kind == READING)
 
 
 GATE = 0.9973  # gate of the defended fold, where the twin has none

@@ -203,7 +203,7 @@ class Bench:
         calm = self.fold(None, estimator, gate).fold
         at, base = calm.base_at(int(np.searchsorted(calm.log.t[: calm.n], begin)))
         log = calm.log.copy()
-        log.n = int(np.searchsorted(log.t[: log.n], end))
+        log.n = int(np.searchsorted(log.events.t, end))
         log.drop_front(at)
         fold = self._folded(estimator, self._tuning(estimator, mistake).set("gate", gate), log, base, mistake.prior)
         return _share(first_word(fold, begin, calm, quiet_of(mistake)), end - begin)
@@ -327,7 +327,7 @@ def first_word(fold: Fold, start: int, calm: Fold | None = None, quiet: tuple[in
 
     Where `calm`, the fold without the mistake, had that health or a worse one at that time, the fault is not detected.
     """
-    t, health = fold.log.t[: fold.n], fold.track.health[: fold.n]
+    t, health = fold.events.t, fold.track.health[: fold.n]
     said = ~np.isin(health, (*quiet, WAITING)) & (t >= start)
     if calm is not None:
         # What holds at a time is what held before its events, and after each of them.
@@ -365,7 +365,7 @@ def accused(fold: Fold, episode: Episode, until: int) -> tuple[str, ...]:
     if not isolates(episode.cause):
         return (episode.subject,)
     seen = fold.log.copy()
-    seen.n = int(np.searchsorted(fold.log.t[: fold.n], until))
+    seen.n = int(np.searchsorted(fold.events.t, until))
     try:
         _, base = fold.base_at(0)
         found = likeliest(suspects(fold.estimator.name, fold.model, fold.tuning, seen, episode.start, base=base))
@@ -379,14 +379,14 @@ def accused(fold: Fold, episode: Episode, until: int) -> tuple[str, ...]:
 
 def green_share(fold: Fold, start: int, end: int) -> float:
     """Share of green rows in [start, end), ns of the log."""
-    t = fold.log.t[: fold.n]
+    t = fold.events.t
     during = (t >= start) & (t < end)
     return float(green(fold)[during].mean()) if during.any() else np.nan
 
 
 def recovery(fold: Fold, end: int) -> float | None:
     """Seconds from `end` (ns) until the twin is green for good; None if it is not at the end of the log."""
-    t, ok = fold.log.t[: fold.n], green(fold)
+    t, ok = fold.events.t, green(fold)
     after = np.flatnonzero(t >= end)
     if not after.size:
         return None

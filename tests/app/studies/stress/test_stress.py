@@ -21,12 +21,12 @@ from app.studies.stress.scenario import (
 )
 from app.twin.twin import load_twin
 from estimators.diagnostics.episodes import Episode
-from estimators.log import INPUT, READING, TICK, TRUTH, Log
+from estimators.log import INPUT, READING, TICK, TRUTH
 from estimators.models import MODELS
 from estimators.track import ADVISORY, DEGRADED, DIVERGED, SUSPECT, TRACKING, WAITING
 from estimators.tuning import Tuning
 from sources.faults.kinds import problem
-from tests.support import SECOND, log_of
+from tests.support import SECOND, as_log, log_of
 
 MODEL = MODELS["motor_drive"]
 
@@ -40,7 +40,7 @@ def folded(health, alarms=None, channel=None):
         alarms=np.zeros((n, 3), np.int32) if alarms is None else np.array(alarms, np.int32).reshape(n, -1),
         flags=np.zeros(n, np.int64),
     )
-    return SimpleNamespace(log=log, track=track, n=n, model=MODEL)
+    return SimpleNamespace(log=log, events=log.events, track=track, n=n, model=MODEL)
 
 
 W, T, S, D = WAITING, TRACKING, SUSPECT, DEGRADED
@@ -115,12 +115,11 @@ def test_subject_and_cause():
 
 def test_a_log_without_truth_keeps_its_rows():
     events = log_of(2, (0, TICK, []), (1, TRUTH, [5.0, 6.0]), (1, READING, [1.0]), (2, TRUTH, [7.0], 1)).events
-    log = Log(2)
-    log.extend(without_truth(events))
-    assert log.n == len(events) and not np.any(log.kind[: log.n] == TRUTH)
-    np.testing.assert_array_equal(log.t[: log.n], events.t)
-    np.testing.assert_array_equal(log.kind[: log.n] == READING, events.kind == READING)
-    np.testing.assert_array_equal(log.value[: log.n][events.kind == READING], events.value[events.kind == READING])
+    log = as_log(without_truth(events))
+    assert log.n == len(events) and not np.any(log.events.kind == TRUTH)
+    np.testing.assert_array_equal(log.events.t, events.t)
+    np.testing.assert_array_equal(log.events.kind == READING, events.kind == READING)
+    np.testing.assert_array_equal(log.events.value[events.kind == READING], events.value[events.kind == READING])
 
 
 @pytest.fixture(scope="module")
