@@ -1,16 +1,19 @@
 """What the tests of several rooms share: a second, logs from a few rows, all that a source gives, the same bits."""
 
 import socket
+import subprocess
 import sys
-from collections.abc import Iterable
+from collections.abc import Callable, Iterable
 from typing import Any
 
 import numpy as np
+import pytest
 
 from estimators.fold import Fold
 from estimators.log import Events, Log
 from estimators.model.state_space import StateSpaceModel
 from estimators.tuning import Tuning
+from tests import ROOT
 
 SECOND = 1_000_000_000
 """Nanoseconds."""
@@ -49,10 +52,25 @@ def free_port(kind: socket.SocketKind = socket.SOCK_STREAM) -> int:
     return port
 
 
+def run_python(code: str, *arguments: object, status: int = 0, **options: Any) -> subprocess.CompletedProcess[str]:
+    """A Python of its own that has run code and ended with this status; for the options see `subprocess.run`."""
+    words = [sys.executable, "-c", code, *map(str, arguments)]
+    ended = subprocess.run(words, **{"cwd": ROOT, "capture_output": True, "text": True} | options)
+    assert ended.returncode == status, ended.stderr
+    return ended
+
+
 def as_log(events: Events) -> Log:
     """A log of these events."""
     log = Log(events.value.shape[1])
     log.extend(events)
+    return log
+
+
+def measured(model: StateSpaceModel, sensor: str, seconds: Any, values: Any, **options: Any) -> Log:
+    """A log of measurements of one sensor by name, see `Log.add`; `options` are those of `Log.of`."""
+    log = Log.of(model, **options)
+    log.add(sensor, seconds, values)
     return log
 
 
@@ -88,6 +106,16 @@ def read_all(source: Any) -> Events:
     while (batch := source.read(0.0)) is not None:
         batches.append(batch)
     return Events.concat(batches, batches[0].value.shape[1])
+
+
+def error_of(
+    kind: type[Exception] | tuple[type[Exception], ...], call: Callable[..., Any], *given: Any, **more: Any
+) -> str:
+    """The text of the error with which a call is refused, one line."""
+    with pytest.raises(kind) as caught:
+        call(*given, **more)
+    assert "\n" not in (text := str(caught.value))
+    return text
 
 
 def assert_same(a: Iterable[Any], b: Iterable[Any]) -> None:

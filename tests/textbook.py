@@ -36,7 +36,7 @@ CHAOS = {
 def simulate(chaos: Chaos, cycles: int, seed: int) -> tuple[np.ndarray, Log]:
     """Return the true states (cycles, nx), which start at a draw of the prior, and measurements of all of them."""
     model, rng = chaos.model, np.random.default_rng(seed)
-    f, p = compile_model(model).f, np.array([parameter.value for parameter in model.parameters])
+    f, p = compile_model(model).f, model.default_parameters
     states = np.empty((cycles * chaos.steps + 1, model.nx))
     states[0] = rng.normal(chaos.mean, chaos.variance**0.5)
     for before, after in zip(states[:-1], states[1:], strict=True):

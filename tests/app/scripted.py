@@ -39,10 +39,7 @@ def solved_by(called):
 def readings(times_s, values):
     """Events of the winding sensor."""
     t = np.round(np.asarray(times_s, float) * SECOND).astype(np.int64)
-    n = t.size
-    return Events(
-        t, t.copy(), np.full(n, READING, np.int8), np.zeros(n, np.int32), np.asarray(values, float).reshape(n, 1)
-    )
+    return Events.alike(READING, t, np.asarray(values, float))
 
 
 def events(model, kind, channel, times, values):
@@ -52,7 +49,7 @@ def events(model, kind, channel, times, values):
     padded = np.full((times.size, model.width), np.nan)
     padded[:, : values.shape[1]] = values
     t = np.round(times * SECOND).astype(np.int64)
-    return Events(t, t, np.full(t.size, kind, np.int8), np.full(t.size, channel, np.int32), padded)
+    return Events.alike(kind, t, padded, channel)
 
 
 def random_walk(n, seed=1, step=0.1):
@@ -181,7 +178,7 @@ class Stepped:
 
     def notices(self):
         """Texts of all notices."""
-        return [line.text for line in self.engine.notices.since(0)]
+        return notice_texts(self.engine)
 
 
 def viewed(model, estimator="kf", view=None):
@@ -203,6 +200,10 @@ def viewed(model, estimator="kf", view=None):
 
     engine.put, engine.submit = put, carry_out
     return engine
+
+
+def notice_texts(engine):
+    return [line.text for line in engine.notices.since(0)]
 
 
 def pull_all(engine):

@@ -19,7 +19,7 @@ from estimators.model.parts import Limits, Stuck
 from estimators.tuning import Tuning
 from sources.source import WRONG_TIME
 from tests.estimators.test_plausibility import model
-from tests.support import SECOND, assert_same
+from tests.support import SECOND, as_log, assert_same
 
 BEAT = SECOND // 4
 HORIZON = 8
@@ -132,9 +132,7 @@ def is_covariance(fold):
 
 def in_order(events):
     """A log to which these events came in the order of measured time."""
-    log = Log.of(MODEL)
-    log.extend(events.select(sorted_order(events)))
-    return log
+    return as_log(events.select(sorted_order(events)))
 
 
 CUTS = st.lists(st.integers(0, 180), max_size=12)

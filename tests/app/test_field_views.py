@@ -28,10 +28,10 @@ from app.views.rerun.rows import RerunRows
 from app.views.viser import field_scenes as field_scene
 from app.views.viser.view import ViserView
 from estimators.errors import ConfigError
-from estimators.fold import Fold
-from estimators.log import READING, Log
+from estimators.log import READING
 from estimators.model.parts import Field
 from tests.app.scripted import Scripted, pull_all
+from tests.support import as_log, folded
 from tests.waiting import wait_for
 
 PLATE = """
@@ -128,11 +128,8 @@ def running(twin, batches):
 
 
 def direct(twin, tuning, estimator, readings):
-    log = Log(twin.model.width)
-    log.extend(readings)
-    fold = Fold(estimator, twin.model, tuning, log, pairs=twin.pairs, picture=twin.picture)
-    fold.advance()
-    return fold
+    log = as_log(readings)
+    return folded(estimator, twin.model, log, tuning, pairs=twin.pairs, picture=twin.picture)
 
 
 def assert_same_pictures(ours, theirs):

@@ -16,6 +16,7 @@ from app.views.recording.writer import RecordingPart
 from app.web.running import OpenedTwin, RunningTwin
 from tests import ROOT
 from tests.app.scripted import row_count
+from tests.support import run_python
 from tests.waiting import LIMIT_S, wait_for
 
 
@@ -51,10 +52,7 @@ print(len(calls) > 2 and done.wait(0.0))
 
 @pytest.mark.skipif(sys.platform == "win32", reason="os.kill ends a process there")
 def test_a_signal_at_any_moment_of_the_wait_ends_it():
-    told = subprocess.run(
-        [sys.executable, "-c", SIGNALS_IN_WAIT], cwd=ROOT, capture_output=True, text=True, check=True, timeout=LIMIT_S
-    )
-    assert told.stdout == "True\n"
+    assert run_python(SIGNALS_IN_WAIT, timeout=LIMIT_S).stdout == "True\n"
 
 
 def test_what_fails_is_raised_once_all_are_done():

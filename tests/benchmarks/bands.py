@@ -42,10 +42,10 @@ from estimators.fit.fit import fit
 from estimators.fit.judge import Z
 from estimators.fit.recording import Recording
 from estimators.fit.uncertainty import parameter_widths
-from estimators.fold import Fold
 from estimators.log import Log
 from estimators.model.parts import Field
 from estimators.track import Track
+from tests.support import folded
 
 from ..skips import data_folder
 from .recordings import CASES, GOOD, Case, halves
@@ -101,8 +101,7 @@ def verdict(coverage: float, ratio: float) -> str:
 
 def score(twin: Twin, log: Log, part: np.ndarray, what: str) -> None:
     """Print a line for each true state and held-out row of a part (n,) of a log."""
-    fold = Fold(twin.estimator, twin.model, twin.tuning, log, policy=twin.policy)
-    fold.advance()
+    fold = folded(twin.estimator, twin.model, log, twin.tuning, policy=twin.policy)
     events, track = log.events, fold.track
     health = health_shares(health_of(events.select(part), track.select(part), twin.policy))
     limits = {state.name: state.withhold for state in twin.model.shown_states}
@@ -212,8 +211,7 @@ def widths_held(name: str, seconds: float, count: int) -> list[tuple[str, float]
             std = level[item.name] or share * p[k]
             p[k] = np.clip(p[k] - std * rng.standard_normal(), item.low, item.high)
         log = logs[i % ASSETS]
-        fold = Fold(twin.estimator, twin.model, replace(twin.tuning, p=p), log.fold.log, policy=twin.policy)
-        fold.advance()
+        fold = folded(twin.estimator, twin.model, log.fold.log, replace(twin.tuning, p=p), policy=twin.policy)
         errors = errors_of(twin, log.truth, fold.track)
         held += [(state, np.mean((np.abs(e) <= Z * std)[e.size // 2 :])) for state, (e, std) in errors.items()]
     return held

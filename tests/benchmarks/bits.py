@@ -25,6 +25,7 @@ from estimators.errors import NisusError
 from estimators.fold import Fold
 from estimators.log import Log
 from estimators.registry import ESTIMATORS, unfit
+from tests.support import folded
 
 EVENTS = 400
 """Events of a log that are folded; of a filter or model that is slow, as many as `SECONDS` allow, but `LEAST`."""
@@ -84,8 +85,7 @@ def hashes(names: list[str]) -> dict[str, str]:
             log.extend(events)
             tuning = replace(twin.tuning, options=twin.options_of(name))
             try:
-                fold = Fold(name, twin.model, tuning, log, pairs=twin.pairs)
-                fold.advance()
+                fold = folded(name, twin.model, log, tuning, pairs=twin.pairs)
                 found[key] = digest(fold)
             except NisusError as error:
                 found[key] = f"not folded: {error}"

@@ -18,8 +18,8 @@ from app.twin.twin import load_twin, with_held
 from estimators.errors import NisusError
 from estimators.fit.fit import fit
 from estimators.fit.recording import Recording
-from estimators.fold import Fold
 from estimators.log import Log
+from tests.support import folded
 
 from .folds import DEFAULT_TWIN, REFOLD_READINGS, endless_log
 from .timing import BenchmarkRow
@@ -119,6 +119,5 @@ def _share() -> None:
 def _fold(noise: float) -> str:
     twin, log = _shared["twin"], _shared["log"]
     assert isinstance(log, Log)
-    fold = Fold("ekf", twin.model, twin.tuning.set(twin.tuning.items()[0].key, noise), log, pairs=twin.pairs)
-    fold.advance()
+    fold = folded("ekf", twin.model, log, twin.tuning.set(twin.tuning.items()[0].key, noise), pairs=twin.pairs)
     return hashlib.sha256(fold.track.mean.tobytes() + fold.track.std.tobytes()).hexdigest()

@@ -51,7 +51,7 @@ class Outcome(NamedTuple):
 
 def folded(twin: Twin, log: Log, parameters: Sequence[str]) -> Outcome:
     """Fold with the parameters held, or as states where the twin estimates them."""
-    fold = Fold(twin.estimator, twin.model, twin.tuning, log)
+    fold = twin.fold(log)
     fold.advance()
     if parameters and parameters[0] in twin.model.state_names:
         return Outcome(fold.track, states_at_end(fold, parameters))
@@ -203,7 +203,7 @@ def recording(case: Case) -> Iterator[BenchmarkRow]:
         if name != "dual":
             way(twin, log, names)  # compiled before it is timed
         outcome, spent = timed(partial(way, twin, log, names))
-        start = int(np.searchsorted(log.t[: log.n], log.t[0] + round(case.window * 1e9)))
+        start = int(np.searchsorted(log.events.t, log.t[0] + round(case.window * 1e9)))
         track = outcome.track
         density = float(np.mean(track.log_likelihood[start:][track.verdict[start:] == USED]))
         remark = f"{case.parameter} {outcome.values[case.parameter]}{outcome.remark}"

@@ -31,6 +31,7 @@ from estimators.models import MODELS
 from estimators.numerics.jit import jit_brief
 from estimators.track import HEALTH_NAMES, SUSPECT
 from estimators.tuning import Tuning
+from tests.support import folded
 
 from ..support import SECOND
 from .filters import ring
@@ -112,8 +113,8 @@ def consistent_log(model: StateSpaceModel, step: float, readings: int, rng: np.r
     comes in with each of the model's own steps, as it does in the filters.
     """
     compiled = compile_model(model)
-    u = np.array([item.default for item in model.inputs], float)
-    p = np.array([item.value for item in model.parameters], float)
+    u = model.default_inputs
+    p = model.default_parameters
     q = np.array([noise.variance for noise in model.noises], float)
     pieces = steps_of(step, model.max_step)
     n = readings // len(model.sensors)
@@ -141,7 +142,7 @@ def consistent_log(model: StateSpaceModel, step: float, readings: int, rng: np.r
 def onsets(fold: Fold) -> Counter[str]:
     """How often each cause began, over all rows, and a cloud became impoverished (which is no test)."""
     track, found = fold.track, Counter[str]()
-    kind, channel = fold.log.kind[: fold.n], fold.log.channel[: fold.n]
+    kind, channel = fold.events.kind, fold.events.channel
     for s, sensor in enumerate(fold.model.sensors):
         masks = track.alarms[(kind == READING) & (channel == s), : len(sensor.rows)]
         began = masks[1:] & ~masks[:-1]
@@ -166,8 +167,7 @@ def count_alarms(case: Case, readings: int, every: float, seed: int) -> tuple[fl
     seconds, found = 0.0, Counter[str]()
     while readings > 0:
         log = consistent_log(case.model, case.step, min(RUN, readings), rng)
-        fold = Fold(case.estimator, case.model, tuning, log, policy=HealthPolicy(false_alarm_every=every))
-        fold.advance()
+        fold = folded(case.estimator, case.model, log, tuning, policy=HealthPolicy(false_alarm_every=every))
         found += onsets(fold)
         seconds += (log.t[log.n - 1] - log.t[0]) / SECOND
         readings -= RUN

@@ -9,14 +9,13 @@ import numpy as np
 from filterpy.kalman import ExtendedKalmanFilter, KalmanFilter, MerweScaledSigmaPoints, UnscentedKalmanFilter
 
 from estimators.estimator import call_predict, call_update
-from estimators.fold import Fold
 from estimators.log import READING, Events, Log
 from estimators.model.assemble import JointParameter, joint
 from estimators.model.state_space import Input, Noise, Parameter, Row, Sensor, State, StateSpaceModel
 from estimators.models import MODELS
 from estimators.numerics.jit import borrowed, floats, jit
 from estimators.registry import ESTIMATORS
-from estimators.tuning import Tuning
+from tests.support import folded
 
 from ..support import SECOND
 from .timing import BenchmarkRow, Bound, compare, medians
@@ -83,13 +82,13 @@ def noisy_log(model: StateSpaceModel, events: int, *, step: float = 1.0) -> Log:
     """Events of the first sensor, `step` seconds apart: noise about what the model expects at its prior."""
     rng = np.random.default_rng(0)
     m = len(model.sensors[0].rows)
-    x = np.array([state.mean for state in model.states])
+    x = model.prior_mean
     expected = np.empty(m)
     model.sensors[0].h(x, model.default_inputs, model.default_parameters, expected)
     t = np.arange(events, dtype=np.int64) * round(step * SECOND)
     value = expected + 0.3 * rng.standard_normal((events, m))
     log = Log(model.width, events)
-    log.extend(Events(t, t, np.full(events, READING, np.int8), np.zeros(events, np.int32), np.ascontiguousarray(value)))
+    log.extend(Events.alike(READING, t, np.ascontiguousarray(value)))
     return log
 
 
@@ -97,8 +96,7 @@ def folding(
     estimator: str, model: StateSpaceModel, log: Log, options: dict[str, float] | None = None
 ) -> Callable[[], None]:
     """A call that folds the whole log again: estimate, NIS, verdict and health of every event."""
-    growing = Fold(estimator, model, Tuning.of(model).with_options(options or {}), log)
-    growing.advance()
+    growing = folded(estimator, model, log, options=options or {})
 
     def again() -> None:
         growing.rewind(0)
@@ -157,7 +155,7 @@ def beside_filterpy() -> Iterator[BenchmarkRow]:
     """A step (predict, update, NIS, verdict, health) beside FilterPy's: processor time, medians, interleaved."""
     motor, ring24 = MODELS["motor_winding"], ring(24, 8)
     small, large = noisy_log(motor, STEPS), noisy_log(ring24, STEPS // 16, step=0.1)
-    x24 = np.array([state.mean for state in ring24.states])
+    x24 = ring24.prior_mean
     x2, P2, Q2 = np.array([35.0, 0.0]), np.diag([25.0, 1.0]), np.diag([0.01, 0.001])
     I24, I8 = np.eye(24), np.eye(8)
 
@@ -182,8 +180,7 @@ def beside_filterpy() -> Iterator[BenchmarkRow]:
 def alone(estimator: str, model: StateSpaceModel) -> Callable[[], None]:
     """Return a call of predictions and updates alone: no estimate, health or log is written."""
     log = noisy_log(model, STEPS, step=0.1)
-    fold = Fold(estimator, model, Tuning.of(model), log)
-    fold.advance()
+    fold = folded(estimator, model, log)
     machine, now = fold.machine, fold._now
     places = (now.u, now.state, machine.work, machine.score, log.value, *np.empty((2, model.width)))
 

@@ -34,6 +34,7 @@ from sources.can.log import CanLog
 from sources.can.mf4 import read_mf4
 from sources.can.readers import Raw, read_messages
 from sources.source import Channel
+from tests.support import as_log
 
 from ..estimators.smoothing.test_textbook import CAR
 from ..models import write_plant
@@ -121,8 +122,7 @@ def smoothing() -> Iterator[BenchmarkRow]:
     """Smoothing of 100,000 readings of a car (4 states, 2 rows) beside the fold and beside peers, processor seconds."""
     ys = np.cumsum(np.random.default_rng(0).normal(0, 0.1, (SMOOTHED, 2)), axis=0)
     t = np.arange(SMOOTHED) * (SECOND // 10)
-    log = Log.of(CAR)
-    log.extend(Events(t, t, np.full(SMOOTHED, READING, np.int8), np.zeros(SMOOTHED, np.int32), ys))
+    log = as_log(Events.alike(READING, t, ys))
     for name in SMOOTHERS:
         fold = Fold(name, CAR, Tuning.of(CAR), log)
         folded, smoothed = medians([partial(again, fold), partial(smooth, fold)], 5)

@@ -37,7 +37,6 @@ from app.twin.fleet import load_fleet
 from app.twin.twin import Twin, load_twin
 from app.web.readings import messages_of
 from app.web.running import OpenedTwin, RunningTwin
-from estimators.fold import Fold
 from estimators.log import READING, Events, Log
 from estimators.snapshots import Base
 from sources.brokers import MqttSource, TopicMap, mqtt_client
@@ -84,9 +83,8 @@ class PipeSource:
         n = records.size
         values = np.full((n, self._width), np.nan)
         values[:, 0] = records["value"]
-        t = records["t"].astype(np.int64)
-        arrival = np.full(n, time.time_ns())
-        return Events(t, arrival, np.full(n, READING, np.int8), np.zeros(n, np.int32), values)
+        events = Events.alike(READING, records["t"].astype(np.int64), values)
+        return events._replace(arrival=np.full(n, time.time_ns()))
 
     def now(self) -> None:
         """See `Source`."""
@@ -162,7 +160,7 @@ def check_states(kills: list[Killed]) -> int:
         assert item.first <= len(events), f"{item.first - len(events)} events were dropped before they were read"
         events = Events.concat([events.select(slice(0, item.first)), item.events], twin.model.width)
     log = Log.resume(twin.model, None, events)
-    fold = Fold(twin.estimator, twin.model, twin.tuning, log, policy=twin.policy, expected=twin.expected)
+    fold = twin.fold(log, policy=twin.policy, expected=twin.expected)
     bases = {item.base.first: item.base for item in kills if item.base is not None}
     for first in sorted(bases):
         fold.advance(first - fold.n)

@@ -55,8 +55,8 @@ def halves(log: Log) -> tuple[Log, np.ndarray]:
     """The first half in time, and a mask (n,) of the second."""
     middle = log.t[0] + (log.t[log.n - 1] - log.t[0]) // 2
     first = log.copy()
-    first.n = int(np.searchsorted(log.t[: log.n], middle))
-    return first, log.t[: log.n] >= middle
+    first.n = int(np.searchsorted(log.events.t, middle))
+    return first, log.events.t >= middle
 
 
 def scored(twin: Twin, estimator: str, setting: Setting, log: Log, second: np.ndarray) -> PartScore:

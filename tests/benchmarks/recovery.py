@@ -33,9 +33,9 @@ from estimators.diagnostics.score import score
 from estimators.fit.entries import TuningEntry, entries_of, with_values
 from estimators.fit.fit import Fitted, fit
 from estimators.fit.recording import Recording
-from estimators.fold import Fold
 from estimators.log import INPUT, READING, Log
 from estimators.track import USED
+from tests.support import folded
 
 from .timing import BenchmarkRow, Bound, both
 
@@ -177,8 +177,7 @@ def recover(case: Case, count: int) -> Recovered:
             found.width.setdefault(line.key, []).append(line.high / line.low)
             found.middle.setdefault(line.key, []).append(line.after)
         other = logs[(k + 1) % count]
-        fold = Fold(twin.estimator, twin.model, fitted.setting.tuning, other)
-        fold.advance()
+        fold = folded(twin.estimator, twin.model, other, fitted.setting.tuning)
         result = score(fold.track, other.events, twin.model, gate=twin.tuning.gate)
         low, high = result.nis_white
         off = abs(result.nis - 0.5 * (high + low))
@@ -202,8 +201,7 @@ def of_the_fit(twin: Twin, fitted: Fitted, log: Log) -> float:
 
     def nis(item: TuningEntry, by: float) -> float:
         given = with_values(tuning, [item], [item.outward(item.inward(item.start) + by)])
-        fold = Fold(twin.estimator, twin.model, given.tuning, log, prior=given.prior)
-        fold.advance()
+        fold = folded(twin.estimator, twin.model, log, given.tuning, prior=given.prior)
         return float(fold.track.nis[fold.track.verdict == USED].mean())
 
     # A difference over half a deviation: of the slope as wide as the estimate is uncertain.
@@ -268,14 +266,14 @@ def tuning() -> Iterator[BenchmarkRow]:
 def _first(log: Log, readings: int) -> Log:
     """Return the part with so many readings."""
     cut = log.copy()
-    cut.n = int(np.flatnonzero(log.kind[: log.n] == READING)[readings - 1]) + 1
+    cut.n = int(np.flatnonzero(log.events.kind == READING)[readings - 1]) + 1
     return cut
 
 
 def _theirs(twin: Twin, log: Log) -> tuple[float, int]:
     """Return seconds and evaluations of a plain loop of SciPy over FilterPy."""
     model, n = twin.model, twin.model.nx
-    p = np.array([item.value for item in model.parameters])
+    p = model.default_parameters
     events = log.events
     prior = model.prior_mean, np.diag(model.prior_std**2)
 
@@ -296,7 +294,7 @@ def _theirs(twin: Twin, log: Log) -> tuple[float, int]:
         points = MerweScaledSigmaPoints(n, alpha=0.5, beta=2.0, kappa=0.0)
         ukf = UnscentedKalmanFilter(n, 3, 1.0, hx, fx, points)
         ukf.x, ukf.P, ukf.R = prior[0].copy(), prior[1].copy(), np.diag(r)
-        u, clock, total = np.array([item.default for item in model.inputs], float), events.t[0], 0.0
+        u, clock, total = model.default_inputs, events.t[0], 0.0
         for t in np.unique(events.t):
             if t > clock:
                 ukf.Q = np.diag(q * (t - clock) * 1e-9)

@@ -26,6 +26,7 @@ from estimators.snapshots import Base
 from estimators.track import USED
 from estimators.tuning import Tuning
 from tests.models import first_state
+from tests.support import folded
 
 from ..support import SECOND
 from ..textbook import CHAOS, simulate
@@ -202,8 +203,7 @@ def analysis(model: StateSpaceModel, name: str, options: dict[str, float], repet
         # A different value, since a copy would be rejected as a duplicate.
         y = model.prior_mean[0] + rng.standard_normal(rows)
         log.extend(Events.one(0, 0, READING, 0, y, model.width))
-    fold = Fold(name, model, Tuning.of(model).with_options(options), log)
-    fold.advance(1)
+    fold = folded(name, model, log, options=options, stop=1)
     gc.collect()
     peak = _peak(reset=True)
     times = [both(lambda: fold.advance(1)) for _ in range(repetitions)]
@@ -265,8 +265,7 @@ def thermal_cycles() -> Iterator[BenchmarkRow]:
         y = 20.0 + rng.standard_normal(model.width)
         log.extend(Events.one((k + 1) * 10**9, 0, READING, 0, y, model.width))
     for title, name, options in (("ETKF", "etkf", {}), ("EnSRF, 0.5 m", "ensrf", {"radius": 0.5})):
-        fold = Fold(name, model, Tuning.of(model).with_options({"members": 40, **options}), log)
-        fold.advance(2)
+        fold = folded(name, model, log, options={"members": 40, **options}, stop=2)
         clock, cpu = both(fold.advance)
         figures = {"per clock s": (cycles - 2) / clock, "per processor s": (cycles - 2) / cpu}
         yield BenchmarkRow(title, figures, (Bound("per clock s", 10, at_least=True),))

@@ -13,6 +13,7 @@ from config.yaml_files import as_flow, as_section, parse
 from estimators.errors import ConfigError
 from estimators.tuning import REOPEN_S
 from tests.cases import cases
+from tests.support import error_of
 
 MOTOR = """\
 model: motor_winding
@@ -148,12 +149,8 @@ def test_files_that_cannot_be_read_are_one_line(tmp_path, monkeypatch):
         ("folder.yaml", "folder.yaml: it is a folder; give the YAML file in it"),
         ("binary.yaml", "binary.yaml:2: it is not UTF-8 text; is this the YAML file?"),
     ):
-        with pytest.raises(ConfigError) as caught:
-            load(name)
-        assert str(caught.value) == said
-    with pytest.raises(ConfigError) as caught:
-        load("motor_windng")
-    text = str(caught.value)
+        assert error_of(ConfigError, load, name) == said
+    text = error_of(ConfigError, load, "motor_windng")
     assert text.startswith("motor_windng: no twin of that name ships; did you mean motor_winding")
     assert text.endswith(", give a YAML file's path, or write one with `nisus new motor_windng`")
 

@@ -1,10 +1,9 @@
 from pathlib import Path
 
-import pytest
-
 from config.loader import load_text
 from estimators.errors import ConfigError
 from tests.cases import cases
+from tests.support import error_of
 
 CAR = """\
 model: road_car
@@ -39,9 +38,7 @@ source:
 
 
 def message(text: str) -> str:
-    with pytest.raises(ConfigError) as caught:
-        load_text(text, Path("car.yaml"))
-    return str(caught.value)
+    return error_of(ConfigError, load_text, text, Path("car.yaml"))
 
 
 @cases(__file__, "source_mistakes.csv")

@@ -60,7 +60,7 @@ def test_gains_and_innovations_of_the_kalman_filter():
     rows = np.vstack((found.model, found.inputs, found.sensors))
     np.testing.assert_allclose(rows, shares_of(matrices, log), rtol=0, atol=1e-9)
     np.testing.assert_array_equal(found.restarts, 0.0)
-    inside = (log.t[: log.n] > SINCE) & (log.t[: log.n] <= UNTIL) & (log.kind[: log.n] == READING)
+    inside = (log.events.t > SINCE) & (log.events.t <= UNTIL) & (log.events.kind == READING)
     np.testing.assert_array_equal(found.readings, np.bincount(log.events.channel[inside], minlength=3))
 
 
@@ -88,7 +88,7 @@ def test_the_sum_is_the_change_and_the_fold_is_as_it_would_have_been(estimator):
     fold.advance()
     assert_same(fold.track, whole.track)
     assert_same(log.events, events)
-    before, after = (int(np.searchsorted(log.t[: log.n], time, side="right")) - 1 for time in (SINCE, UNTIL))
+    before, after = (int(np.searchsorted(log.events.t, time, side="right")) - 1 for time in (SINCE, UNTIL))
     np.testing.assert_array_equal(found.before, whole.track.mean[before])
     np.testing.assert_array_equal(found.after, whole.track.mean[after])
     total = found.model + found.inputs.sum(axis=0) + found.sensors.sum(axis=0) + found.restarts

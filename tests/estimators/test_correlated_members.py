@@ -148,7 +148,7 @@ def test_a_sensor_of_200_rows_has_200_degrees_of_freedom(missing):
     y[:, :missing] = np.nan
     log = Log.of(GAUGES)
     t = np.arange(READINGS) * 10**9
-    log.extend(Events(t, t, np.full(READINGS, READING, np.int8), np.zeros(READINGS, np.int32), y))
+    log.extend(Events.alike(READING, t, y))
     track = fold("kf", GAUGES, Tuning.of(GAUGES), log)
     m = ROWS - missing
     assert track.dof.tolist() == [m] * READINGS == degrees(track).tolist()

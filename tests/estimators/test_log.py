@@ -25,10 +25,9 @@ def any_seed(test):
 def batch(times, first=0, kind=READING, width=2):
     """Events whose value[0] numbers them."""
     t = np.asarray(times, np.int64)
-    n = t.size
-    value = np.full((n, width), np.nan)
-    value[:, 0] = first + np.arange(n)
-    return Events(t, t + 5, np.full(n, kind, np.int8), np.zeros(n, np.int32), value)
+    value = np.full((t.size, width), np.nan)
+    value[:, 0] = first + np.arange(t.size)
+    return Events.alike(kind, t, value)._replace(arrival=t + 5)
 
 
 def pieces(rng, events):
@@ -257,7 +256,7 @@ def test_inputs_hold_for_the_readings_of_their_time_and_a_reset_comes_last():
     np.testing.assert_array_equal(track.mean[3], MODEL.prior_mean)
     # The innovation is y - H m - D u, with the input of that very time.
     without = as_log(Events.concat(events[2:3], WIDTH))
-    u = np.array([item.default for item in MODEL.inputs])
+    u = MODEL.default_inputs
     D = random_linear(np.random.default_rng(1), 3, 2).D[1]
     plain = fold("ekf", MODEL, Tuning.of(MODEL), without)
     expected = plain.innovation[0, :2] - D @ (np.array([3.0, 4.0]) - u)

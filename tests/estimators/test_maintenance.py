@@ -20,7 +20,7 @@ def stream(n=300, at=(100, 200), states=(1,), seed=0):
     """Readings of the winding at every second, and maintenance half a second after those numbered `at`."""
     y = 40.0 + np.cumsum(np.random.default_rng(seed).normal(size=n))
     t = np.arange(1, n + 1) * SECOND
-    readings = Events(t, t, np.full(n, READING, np.int8), np.zeros(n, np.int32), y.reshape(n, 1))
+    readings = Events.alike(READING, t, y)
     changes = [maintained((k + 1) * SECOND + HALF, 0, states, MODEL.width) for k in at]
     return Events.concat([readings, *changes], MODEL.width)
 
@@ -35,7 +35,7 @@ def test_the_kalman_filter_is_the_textbooks_with_the_covariance_edited():
     tuning = Tuning.of(MODEL)
     track = fold("kf", MODEL, tuning, log, pairs=PAIR)
     made = compile_model(MODEL)
-    n, u = MODEL.nx, np.array([item.default for item in MODEL.inputs])
+    n, u = MODEL.nx, MODEL.default_inputs
     H = np.zeros((1, n))
     H[0, 0] = 1.0
     x, P, clock = MODEL.prior_mean.copy(), np.diag(MODEL.prior_std**2), None
@@ -71,7 +71,7 @@ def test_the_kalman_filter_is_the_textbooks_with_the_covariance_edited():
 @pytest.mark.parametrize("estimator", ["kf", "ekf", "iekf", "ukf", "ckf", "sr-kf", "sr-ekf", "sr-ukf"])
 def test_mean_stays_and_the_variance_is_the_priors(estimator):
     log = log_of(Events.concat([stream(), query()], MODEL.width))
-    track = fold(estimator, MODEL, Tuning.of(MODEL), log, pairs=PAIR)
+    track = folded(estimator, MODEL, log, pairs=PAIR).track
     rows = np.flatnonzero(log.events.kind == MAINTENANCE)
     assert rows.size == 2
     for row in rows:
@@ -102,7 +102,7 @@ def test_members_are_drawn_from_the_same(estimator, count):
 def test_versions_count_times_not_states():
     log = log_of(stream(states=(0, 1)))
     versions = model_versions(log.events)
-    t = log.t[: log.n]
+    t = log.events.t
     expected = 1 + (t >= 101 * SECOND + HALF) + (t >= 201 * SECOND + HALF)
     np.testing.assert_array_equal(versions, expected)
     assert [model_version_at(log, s * SECOND) for s in (0, 101, 102, 250)] == [1, 1, 2, 3]
@@ -112,7 +112,7 @@ def test_versions_count_times_not_states():
 def test_versions_go_on_after_the_oldest_events_are_dropped(count):
     """Also where a maintenance of two states is cut in half."""
     log = log_of(stream(states=(0, 1)))
-    t, versions = log.t[: log.n].copy(), model_versions(log.events)
+    t, versions = log.events.t.copy(), model_versions(log.events)
     log.drop_front(count)
     after = model_versions(log.events, log.version)
     # The half that stays begins the version that its first half had begun.
@@ -143,7 +143,7 @@ def test_a_log_that_resumes_from_a_base_counts_versions_on():
 
 def test_before_anything_was_said_it_starts_at_the_prior():
     log = log_of(Events.concat([maintained(0, 0, [0], MODEL.width), stream(10, at=())], MODEL.width))
-    track = fold("kf", MODEL, Tuning.of(MODEL), log)
+    track = folded("kf", MODEL, log).track
     np.testing.assert_allclose(track.mean[0], MODEL.prior_mean)
     np.testing.assert_allclose(track.std[0], MODEL.prior_std)
     assert INPUT not in log.events.kind

@@ -11,7 +11,7 @@ from hypothesis import strategies as st
 from estimators.diagnostics.detectors import OUTSIDE, REFUSED, STUCK
 from estimators.diagnostics.episodes import episodes
 from estimators.errors import ModelError
-from estimators.fold import Fold, fold
+from estimators.fold import Fold
 from estimators.log import READING, Events, Log
 from estimators.model.parts import RATE_NOISE_STDS, Limits, Stuck
 from estimators.model.state_space import Noise, Row, Sensor, State, StateSpaceModel
@@ -19,7 +19,7 @@ from estimators.models import MODELS
 from estimators.track import DUPLICATE, MISSING, RANGE, RATE, REPEATED, SATURATED, SCREENED, SUSPECT, USED
 from estimators.tuning import Tuning
 from tests.models import first_state, first_states, unchanged
-from tests.support import SECOND, as_log, folded
+from tests.support import SECOND, as_log, folded, measured
 
 BEAT = SECOND // 4
 """Times are multiples of a quarter of a second and values of a quarter of a unit: sums of these are exact."""
@@ -135,7 +135,7 @@ reading = st.one_of(
 def test_the_kernel_finds_what_the_rules_say_however_it_is_cut(a, b, rows, data):
     walk = model(a, b)
     log = as_log(events(rows, walk.width))
-    ordered = [(int(t) // BEAT, int(s), tuple(y[: s + 1])) for t, s, y in zip(log.t, log.channel, log.value[: log.n])]
+    ordered = [(int(t) // BEAT, int(s), tuple(y[: s + 1])) for t, s, y in zip(log.t, log.channel, log.events.value)]
     growing = Fold("kf", walk, Tuning.of(walk), log)
     cuts = sorted(data.draw(st.lists(st.integers(0, log.n), max_size=3)))
     for start, stop in zip([0, *cuts], [*cuts, log.n]):
@@ -153,7 +153,7 @@ STRICT = Limits(
 def stream(rng, walk, n):
     """Two sensors of a walk, with spikes, runs of one value, copies, and rows that are missing."""
     t = np.cumsum(rng.integers(1, SECOND // 2, n))
-    channel = rng.integers(0, 2, n).astype(np.int32)
+    channel = rng.integers(0, 2, n)
     y = np.round(np.cumsum(rng.normal(0, 0.1, (n, 2)), 0) + rng.normal(0, 0.25, (n, 2)), 1)
     y[rng.random((n, 2)) < 0.05] = 27.0
     y[rng.random((n, 2)) < 0.05] = -90.0
@@ -163,7 +163,7 @@ def stream(rng, walk, n):
     y[channel == 0, 1] = np.nan
     value = np.full((n, walk.width), np.nan)
     value[:, :2] = y
-    first = Events(t, t, np.full(n, READING, np.int8), channel, value)
+    first = Events.alike(READING, t, value, channel)
     again = first.select(rng.permutation(n)[: n // 4])
     later = again._replace(t=again.t + rng.integers(0, SECOND // 50, len(again)))
     return Events.concat([first, later], walk.width)
@@ -176,16 +176,16 @@ FILTERS = ["kf", "ukf", "pf", "enkf", "filterpy-kf"]
 def test_a_screened_row_is_to_the_filter_a_row_that_is_missing(name):
     strict, free = model(STRICT, STRICT), model()
     log = as_log(stream(np.random.default_rng(3), strict, 300))
-    found = fold(name, strict, Tuning.of(strict), log)
+    found = folded(name, strict, log).track
     assert {RANGE, RATE, REPEATED, SATURATED, DUPLICATE} <= {
         1 << k for k in range(5) if np.any(found.screened & (1 << k))
     }
     bare = log.copy()
     bare.value[: log.n, : free.ny][found.screened != 0] = np.nan
-    expected = fold(name, free, Tuning.of(free), bare)
+    expected = folded(name, free, bare).track
     for column in ("mean", "std", "innovation", "innovation_std", "nis", "log_likelihood"):
         np.testing.assert_array_equal(getattr(found, column), getattr(expected, column), err_msg=column)
-    rows = np.isfinite(log.value[: log.n, :2]).sum(axis=1)
+    rows = np.isfinite(log.events.value[:, :2]).sum(axis=1)
     lost = (found.screened != 0).sum(axis=1)
     assert np.array_equal(found.verdict == SCREENED, (lost > 0) & (lost == rows))
     assert np.array_equal(expected.verdict == MISSING, (found.verdict == SCREENED) | (found.verdict == MISSING))
@@ -222,7 +222,7 @@ def test_a_gateway_that_repeats_everything_makes_the_band_no_narrower(seconds, l
     ends = {}
     for times in (1, 5):
         log = as_log(repeated(times, seconds))
-        track = fold("kf", walk, Tuning.of(walk), log)
+        track = folded("kf", walk, log).track
         ends[times] = track
         assert np.sum(track.screened & DUPLICATE != 0) == 400 * (times - 1)
     first = ends[5].screened[:, 0] == 0
@@ -234,7 +234,7 @@ def test_a_gateway_that_repeats_everything_makes_the_band_no_narrower(seconds, l
     if seconds:
         free = model()
         log = as_log(repeated(5, seconds))
-        believed = fold("kf", free, Tuning.of(free), log).std[-1, 0] / ends[1].std[-1, 0]
+        believed = folded("kf", free, log).track.std[-1, 0] / ends[1].std[-1, 0]
         # A walk's steady P = (√(q² + 4qR) - q) / 2, here with R/5; the copies' 0.04 s add 6 % to P.
         q, r = 0.01, 1 / 16
         of_five, of_one = (math.sqrt(q * q + 4 * q * share) - q for share in (r / 5, r))
@@ -252,7 +252,7 @@ def test_a_quantum_alone_speaks_less_than_once_a_day_and_soon_when_stuck():
     y = np.round(rng.normal(0, sigma, n) / quantum) * quantum
     y[-60:] = y[-60]
     log.add("a", t * 1e-9, y)
-    found = np.flatnonzero(fold("kf", walk, Tuning.of(walk), log).screened[:, 0])
+    found = np.flatnonzero(folded("kf", walk, log).track.screened[:, 0])
     begins = found[np.diff(found, prepend=-9) > 1]
     p = math.erf(quantum / (2 * math.sqrt(2) * sigma))
     # A Poisson count of mean `days` at most passes its mean by five standard deviations once in 10⁵.
@@ -268,8 +268,8 @@ def test_a_sensor_that_is_always_refused_is_lost_and_said_to_be():
     rng = np.random.default_rng(4)
     log.add("a", t, 40 + rng.normal(0, 0.25, 200))
     log.add("b", t, rng.normal(0, 0.25, (200, 2)))
-    track = fold("kf", walk, Tuning.of(walk), log)
-    of_a = log.channel[: log.n] == 0
+    track = folded("kf", walk, log).track
+    of_a = log.events.channel == 0
     assert np.all(track.verdict[of_a] == SCREENED) and np.all(track.verdict[~of_a] == USED)
     assert track.alarms[of_a][-1, 0] & REFUSED and not np.any(track.alarms[~of_a] & REFUSED)
 
@@ -277,7 +277,7 @@ def test_a_sensor_that_is_always_refused_is_lost_and_said_to_be():
 def test_copies_are_no_stuck_sensor():
     walk = model(Limits(duplicates=0.05))
     log = as_log(repeated(5, 0.05))
-    assert not np.any(fold("kf", walk, Tuning.of(walk), log).alarms & STUCK)
+    assert not np.any(folded("kf", walk, log).track.alarms & STUCK)
 
 
 @pytest.mark.parametrize("celsius", [0.0, 25.0])
@@ -287,7 +287,7 @@ def test_a_battery_outside_the_range_of_its_fit_says_so(celsius):
     t = np.arange(600.0)
     log.add_inputs(t, current=np.ones(600), air=np.full(600, celsius))
     log.add("temperature", t, np.full(600, celsius))
-    track = fold("ekf", cell, Tuning.of(cell), log)
+    track = folded("ekf", cell, log).track
     outside = track.flags & OUTSIDE != 0
     # The estimate begins at 25 °C and believes the thermometer within seconds.
     assert outside[20:].all() if celsius == 0.0 else not outside.any()
@@ -323,8 +323,7 @@ def test_a_sensor_whose_readings_all_break_their_limits_is_an_episode_of_its_own
     rng, q, r = np.random.default_rng(5), walk.noises[0].variance, walk.sensors[0].rows[0].variance
     y = np.cumsum(rng.normal(0.0, np.sqrt(q), 600)) + rng.normal(0.0, np.sqrt(r), 600)
     y[400:] += 100.0
-    log = Log.of(walk)
-    log.add("a", np.arange(600.0), y)
+    log = measured(walk, "a", np.arange(600.0), y)
     found = folded("kf", walk, log)
     each = next(episode for episode in episodes(found) if episode.cause == "screened")
     assert (each.start, each.end, each.size) == (400.0, None, 1.0)

@@ -11,6 +11,7 @@ from estimators.models import MODELS
 from estimators.tuning import Tuning
 from tests.cases import cases
 from tests.estimators.interpreted.test_filterpy import PENDULUM
+from tests.support import error_of
 
 MOTOR = MODELS["motor_winding"]
 
@@ -51,10 +52,7 @@ def test_versions_never_repeat():
 
 @cases(__file__, "wrong_tunings.csv")
 def test_what_is_wrong_is_one_line(key, value, says):
-    with pytest.raises(ConfigError) as refused:
-        Tuning.of(MOTOR).set(key, json.loads(value))
-    assert says in str(refused.value)
-    assert "\n" not in str(refused.value)
+    assert says in error_of(ConfigError, Tuning.of(MOTOR).set, key, json.loads(value))
 
 
 def test_a_parameter_stays_in_its_range():

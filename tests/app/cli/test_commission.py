@@ -18,6 +18,7 @@ from estimators.errors import ConfigError
 from estimators.fold import fold
 from estimators.track import DIVERGED
 from tests.cases import cases
+from tests.support import error_of
 
 TWIN = """\
 # A drive.
@@ -109,9 +110,8 @@ def test_the_rest_of_the_file_stays(tmp_path, text, end):
 
 def test_too_little_is_one_line(tmp_path):
     path = drive(tmp_path)
-    with pytest.raises(ConfigError) as problem:
-        commission_twin(CommissionCommand(path, duration=20.0, write=True))
-    assert str(problem.value) == "no sensor row has 50 readings that were judged; commission on a longer recording"
+    text = error_of(ConfigError, commission_twin, CommissionCommand(path, duration=20.0, write=True))
+    assert text == "no sensor row has 50 readings that were judged; commission on a longer recording"
     assert Path(path).read_text() == TWIN
 
 
@@ -123,9 +123,7 @@ def test_a_file_that_cannot_be_written_is_one_line(tmp_path):
 @cases(__file__, "wrong_baselines.csv")
 def test_a_wrong_section_is_one_line(tmp_path, section, said):
     path = drive(tmp_path, TWIN + "commissioned:\n" + section)
-    with pytest.raises(ConfigError) as problem:
-        load_twin(path)
-    assert said in str(problem.value) and "\n" not in str(problem.value)
+    assert said in error_of(ConfigError, load_twin, path)
 
 
 def test_a_twin_is_commissioned_against_white_innovations_whatever_was_normal_before(tmp_path):

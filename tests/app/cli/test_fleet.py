@@ -15,8 +15,7 @@ from app.twin.fleet import load_fleet
 from app.twin.twin import load_twin
 from estimators import Log
 from estimators.errors import NisusError
-from estimators.fold import Fold
-from estimators.log import Events
+from estimators.log import READING, Events
 from estimators.track import HEALTH_NAMES, VERDICT_NAMES
 from tests.cases import cases
 
@@ -56,11 +55,10 @@ def folded(rows, asset, until):
     own = [(t, y) for t, name, y in rows if name == asset]
     t = np.array([round(t * 1e9) for t, _ in own])
     log = Log.of(twin.model)
-    count = t.size
-    log.extend(Events(t, t, np.zeros(count, np.int8), np.zeros(count, np.int32), np.array([[y] for _, y in own])))
+    log.extend(Events.alike(READING, t, np.array([y for _, y in own])))
     if until - own[-1][0] > twin.policy.degraded_after:
         log.add_ticks(until)
-    fold = Fold("kf", twin.model, twin.tuning, log, policy=twin.policy, expected=np.zeros(1, np.bool_))
+    fold = twin.fold(log, policy=twin.policy, expected=np.zeros(1, np.bool_))
     fold.advance()
     return fold.track.select(fold.n - 1), fold.n
 

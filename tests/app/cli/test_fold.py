@@ -18,11 +18,11 @@ from estimators.diagnostics.episodes import Episode
 from estimators.diagnostics.references import HALF_WIDTH
 from estimators.fold import Fold as FoldOf
 from estimators.interface.by_name import fold as fold_by_name
-from estimators.log import Log
 from estimators.models import MODELS
 from estimators.track import HEALTH_NAMES
 from estimators.tuning import Tuning
 from tests.app.present.export.test_report import data_of
+from tests.support import measured
 
 DRIVE = """\
 model: motor_winding
@@ -375,8 +375,7 @@ def test_the_json_says_what_a_script_needs(tmp_path, nisus):
 
 def test_what_was_dropped_is_said_if_it_was_much():
     model = MODELS["motor_winding"]
-    log = Log.of(model)
-    log.add("winding", np.arange(10.0), np.full(10, 35.0))
+    log = measured(model, "winding", np.arange(10.0), np.full(10, 35.0))
     folded = FoldOf("kf", model, Tuning.of(model), log)
     folded.advance()
     assert dropped({}, folded) == [] and dropped({"stale": 0, "wrong time": 0}, folded) == []

@@ -10,8 +10,8 @@ from rosbags.typesys import Stores, get_typestore
 
 from app.twin.log_reader import read_log
 from app.twin.twin import load_twin
-from estimators.fold import Fold
 from tests.sources.tables.bags import joints, odometry, write_folder, write_mcap
+from tests.support import folded
 
 START = 1_700_000_000 * 10**9
 
@@ -107,8 +107,7 @@ def test_an_estimate_is_written_as_a_bag(tmp_path, nisus):
             np.testing.assert_array_equal([one.effort[k] for one in messages], table[spread])
     loaded = load_twin(twin)
     log, _ = read_log(loaded, None)
-    fold = Fold(loaded.estimator, loaded.model, loaded.tuning, log, pairs=np.array([[0, 1]]))
-    fold.advance()
+    fold = folded(loaded.estimator, loaded.model, log, loaded.tuning, pairs=np.array([[0, 1]]))
     matrices = np.array([one.data.reshape(2, 2) for _, one in found["/mcap/covariance"]])
     np.testing.assert_array_equal(matrices[:, 0, 1], fold.track.cross[:, 0])
     np.testing.assert_array_equal(matrices[:, 1, 0], fold.track.cross[:, 0])

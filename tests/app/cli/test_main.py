@@ -15,14 +15,14 @@ from app.cli.main import described, main, parse
 from config.loader import shipped
 from tests import ROOT
 from tests.cases import cases
+from tests.support import run_python
 
 FULL = Path("/dev/full")
 needs_full = pytest.mark.skipif(not FULL.exists(), reason="there is no /dev/full")
 
 
 def test_twins_are_listed_without_numba():
-    code = "import sys; from app.cli.main import main; main(['twins']); assert 'numba' not in sys.modules"
-    assert subprocess.run([sys.executable, "-c", code], capture_output=True).returncode == 0
+    run_python("import sys; from app.cli.main import main; main(['twins']); assert 'numba' not in sys.modules")
 
 
 @pytest.mark.parametrize("name", NAMES)
@@ -100,8 +100,7 @@ except SystemExit as left:
 os.write(said, str(status).encode())
 sys.stdout.flush()
 """
-    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=False)
-    assert (done.stderr, done.returncode) == ("0", 0)
+    assert run_python(code).stderr == "0"
 
 
 COMPLETED = {

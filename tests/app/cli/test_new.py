@@ -16,7 +16,7 @@ from estimators.log import READING, truth_of
 from estimators.model.state_space import StateSpaceModel
 from estimators.model.user_file import imported_beside, run_file
 from estimators.track import USED
-from tests.support import as_log, read_all
+from tests.support import as_log, error_of, read_all
 
 
 def test_the_pair_that_new_writes_loads_as_it_stands(tmp_path):
@@ -45,9 +45,7 @@ def test_a_twin_in_the_root_of_a_checkout_loads(tmp_path):
 
 
 def refused(name, folder):
-    with pytest.raises(ConfigError) as caught:
-        write_twin(name, folder)
-    return str(caught.value)
+    return error_of(ConfigError, write_twin, name, folder)
 
 
 @pytest.mark.parametrize("name", ["", "1pump", "../pump", "pump.yaml", "pu mp", "-pump", "pümp"])

@@ -1,10 +1,8 @@
 """The fork server has loaded what the process of a twin needs before its page is there."""
 
 import json
-import subprocess
-import sys
 
-from tests import ROOT
+from tests.support import run_python
 from tests.waiting import LIMIT_S
 
 PROGRAM = """
@@ -27,9 +25,6 @@ session.stop()
 
 
 def test_a_twin_opens_without_further_libraries(tmp_path):
-    run = subprocess.run(
-        [sys.executable, "-c", PROGRAM, str(tmp_path)], cwd=ROOT, capture_output=True, text=True, timeout=LIMIT_S
-    )
-    complete, loaded = json.loads(run.stdout.splitlines()[-1])
+    complete, loaded = json.loads(run_python(PROGRAM, tmp_path, timeout=LIMIT_S).stdout.splitlines()[-1])
     assert complete
     assert [name for name in loaded if name.split(".")[0] in ("PIL", "app", "config", "imageio")] == []

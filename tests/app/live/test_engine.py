@@ -432,10 +432,10 @@ def test_failures_are_counted_by_sensor_once_however_often_they_are_folded():
 
     def batch(*readings):
         t = np.array([round(second * SECOND) for second, _, _ in readings])
-        channel = np.array([sensor for _, sensor, _ in readings], np.int32)
+        channel = np.array([sensor for _, sensor, _ in readings])
         value = np.full((t.size, model.width), np.nan)
         value[:, 0] = [y for _, _, y in readings]
-        return Events(t, t.copy(), np.full(t.size, READING, np.int8), channel, value)
+        return Events.alike(READING, t, value, channel)
 
     stepped.put(batch((0.01, force, np.nan), (0.02, force, 1e9), (0.03, position, np.nan), (0.04, force, np.nan)))
     stepped.put(batch((0.05, force, np.nan), (0.06, position, 0.0)))
@@ -477,8 +477,7 @@ def test_a_black_box_that_fails_loses_nothing_and_is_reported_once():
     assert status.counts["failed"] == 5 and status.counts["used"] == 10 and "engine error" not in status.counts
     assert np.all(pull.track.health[5:10] == DIVERGED) and np.all(np.isnan(pull.track.mean[5:10]))
     kept = np.r_[0:5, 10:15]
-    log = Log(box.width)
-    log.extend(readings(times[kept], values[kept]))
+    log = as_log(readings(times[kept], values[kept]))
     expected = fold("filterpy-ukf", box, Tuning.of(box), log)
     np.testing.assert_array_equal(pull.track.mean[kept], expected.mean)
     np.testing.assert_array_equal(pull.track.std[kept], expected.std)

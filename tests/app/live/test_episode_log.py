@@ -11,12 +11,11 @@ from app.live.engine import Engine
 from app.live.episode_log import EpisodeLog
 from estimators import Input
 from estimators.diagnostics.episodes import Episode, episodes
-from estimators.fold import Fold
-from estimators.log import Log
 from estimators.track import GATED, HEALTH_NAMES, Track
-from tests.app.scripted import MODEL, Replayed, Scripted, Stepped, readings, twin
+from tests.app.scripted import MODEL, Replayed, Scripted, Stepped, notice_texts, readings, twin
 from tests.cases import cases
 from tests.models import level_model
+from tests.support import as_log, folded
 
 N = 1800
 """Readings, one a second: twice as noisy from the 300th to the 500th, stuck from the 1600th on."""
@@ -44,20 +43,14 @@ def engine():
 
 def whole(engine):
     """The episodes of one fold over the engine's log."""
-    log = Log.of(MODEL)
-    log.extend(engine._log.events)
-    fold = Fold("kf", MODEL, engine.tuning, log, pairs=engine.pairs, policy=engine.policy)
-    fold.advance()
+    log = as_log(engine._log.events)
+    fold = folded("kf", MODEL, log, engine.tuning, pairs=engine.pairs, policy=engine.policy)
     return episodes(fold)
 
 
 def watch(engine):
     """Let the episode log look, as its job does."""
     engine._watchers.episode_log.update()
-
-
-def said(engine):
-    return [line.text for line in engine.notices.since(0)]
 
 
 def same(found, expected):
@@ -92,7 +85,7 @@ def test_readings_that_come_late_take_rows_back(engine, asset):
         watch(engine)
     same(engine.episodes(), whole(engine))
     assert before != engine.episodes()
-    assert sum("too narrow" in text for text in said(engine)) == 1
+    assert sum("too narrow" in text for text in notice_texts(engine)) == 1
 
 
 def test_each_is_said_once_when_it_begins_and_when_it_is_over(engine, asset):
@@ -118,7 +111,7 @@ def test_each_is_said_once_when_it_begins_and_when_it_is_over(engine, asset):
     # of 0.74 and a deviation of 0.3 · 4 √2 = 1.7, so n readings suffice with 95 % where 0.74 n - 1.64 · 1.7 √n = 14.4.
     assert first.t == engine._log.t[np.flatnonzero(engine._fold.track.alarms.any(axis=1))[0]]
     assert 0 <= first.t * 1e-9 - narrow.start < 45
-    assert sum(text.startswith("winding: no longer") for text in said(engine)) == 1
+    assert sum(text.startswith("winding: no longer") for text in notice_texts(engine)) == 1
     assert lasted and engine.status().episodes_open == 0 and engine.status().cause == ""
     assert engine.status().sensors == {"winding": ("tracking", "")}
 
@@ -164,7 +157,7 @@ def test_what_lasts_hides_no_later_loss(engine, rows):
     assert [(each.cause, each.start) for each in (wide, stuck)] == [(each.cause, each.start) for each in expected]
     assert wide.end is None and stuck.end == pytest.approx(1100.0) == expected[1].end
     assert episode_log.tracker.n <= rows
-    assert sum(text.startswith("winding: no longer stuck") for text in said(engine)) == 1
+    assert sum(text.startswith("winding: no longer stuck") for text in notice_texts(engine)) == 1
 
 
 def test_another_revision_begins_anew_and_says_nothing_twice(asset):
@@ -172,12 +165,12 @@ def test_another_revision_begins_anew_and_says_nothing_twice(asset):
     engine, t, y = stepped.engine, asset[0][:400], asset[1][:400]
     stepped.put(readings(t, y))
     watch(engine)
-    assert engine.episodes()[-1].end is None and sum("too narrow" in text for text in said(engine)) == 1
+    assert engine.episodes()[-1].end is None and sum("too narrow" in text for text in notice_texts(engine)) == 1
     # As narrow as before, or nearly.
     stepped.submit(commands.SetTuning("R.winding", 3.0))
     watch(engine)
     same(engine.episodes(), whole(engine))
-    assert sum("too narrow" in text for text in said(engine)) == 1
+    assert sum("too narrow" in text for text in notice_texts(engine)) == 1
     # Wide bands explain the readings: what was open has gone, and is not carried on.
     stepped.submit(commands.SetTuning("R.winding", 100.0))
     watch(engine)
@@ -192,7 +185,7 @@ def test_a_source_that_begins_again_has_an_episode_log_of_its_own(asset):
         stepped.put(readings(t, y))
         watch(engine)
         # What lasted in the life before is said again in this one.
-        assert sum("too narrow" in text for text in said(engine)) == begun
+        assert sum("too narrow" in text for text in notice_texts(engine)) == begun
         same(engine.episodes(), whole(engine))
         stepped.source.restart()
 
@@ -217,7 +210,7 @@ def test_a_refused_sensor_is_said_once_and_not_reading_by_reading(asset):
             told.append((known, any(text.startswith("winding: measurement rejected") for text in new)))
         watch(engine)
     assert refused > 3 and all(line != known for known, line in told)
-    assert sum("is rejected by the gate" in text for text in said(engine)) == 1
+    assert sum("is rejected by the gate" in text for text in notice_texts(engine)) == 1
 
 
 @cases(__file__, "causes.csv")

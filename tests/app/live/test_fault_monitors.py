@@ -17,15 +17,14 @@ from estimators.models import MODELS
 from estimators.tuning import Tuning
 from sources.simulator import Simulator, constant_input, stepped_input
 from tests.app.scripted import MODEL, Stepped, random_walk, readings, twin
-from tests.support import read_all
+from tests.support import as_log, measured, read_all
 
 FALSE_ALARM = 86400.0
 DRIVE = MODELS["motor_drive"]
 
 
 def folded(n, estimator="kf"):
-    log = Log(MODEL.width)
-    log.extend(readings(*random_walk(n)))
+    log = as_log(readings(*random_walk(n)))
     fold = Fold(estimator, MODEL, twin().tuning, log)
     fold.advance()
     return fold
@@ -48,8 +47,7 @@ def test_the_status_shows_the_sensitivity_of_the_same_events():
     assert (before["integrity"], before["integrity_age"]) == ({}, None)
     engine._watchers.integrity.look(Job("test"))
     found = stepped.status().integrity
-    log = Log(MODEL.width)
-    log.extend(readings(*random_walk(600)))
+    log = as_log(readings(*random_walk(600)))
     tuning, name = engine.folded_with()
     computed = sensitivity(name, MODEL, tuning, log, false_alarm=engine.policy.false_alarm_every)
     assert found.reason == "" and found.t == int(log.t[log.n - 1])
@@ -124,8 +122,7 @@ def test_nothing_is_computed_twice_nor_without_events_nor_once_cancelled():
 
 def test_filters_that_draw_and_large_fields_have_a_reason_instead():
     field = load_twin("thermal_field").model
-    log = Log.of(field)
-    log.add("thermocouples", 1.0, np.zeros((1, field.ny)))
+    log = measured(field, "thermocouples", 1.0, np.zeros((1, field.ny)))
     large = EventWindow("ekf", twin().tuning, log.events, folded(1).track, None, 0)
     for taken, reason in ((event_window(folded(300, "pf"), 0, 4000), "pf draws at random"), (large, "")):
         watch = ProtectionMonitor(lambda taken=taken: taken, FALSE_ALARM)
@@ -142,10 +139,9 @@ def drive():
         "speed": constant_input(250.0),
         "coolant": constant_input(40.0),
     }
-    log = Log.of(DRIVE)
-    log.extend(read_all(Simulator(DRIVE, seed=2, step=0.1, duration=90.0, inputs=inputs)))
-    wrong = (log.kind[: log.n] == READING) & (log.channel[: log.n] == DRIVE.sensor_names.index("yoke"))
-    log.value[: log.n][wrong & (log.t[: log.n] >= 60 * 10**9), 0] += 2.0
+    log = as_log(read_all(Simulator(DRIVE, seed=2, step=0.1, duration=90.0, inputs=inputs)))
+    wrong = (log.events.kind == READING) & (log.events.channel == DRIVE.sensor_names.index("yoke"))
+    log.events.value[wrong & (log.events.t >= 60 * 10**9), 0] += 2.0
     fold = Fold("ekf", DRIVE, Tuning.of(DRIVE), log)
     fold.advance()
     return fold

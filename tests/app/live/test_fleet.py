@@ -5,8 +5,6 @@ import io
 import json
 import os
 import signal
-import subprocess
-import sys
 import time
 from contextlib import nullcontext
 from types import MappingProxyType, SimpleNamespace
@@ -22,10 +20,8 @@ from app.twin.fleet import load_fleet
 from app.twin.twin import load_twin
 from app.web.fleet import FleetApi
 from app.web.readings import READERS, messages_of, routes, send_to, summary
-from estimators import Log
 from estimators.errors import NisusError, SourceError
-from estimators.fold import Fold
-from estimators.log import Events
+from estimators.log import READING, Events
 from estimators.track import HEALTH_NAMES, STALE, USABLE
 from sources.brokers import TopicMap
 from sources.messages import FORGOTTEN
@@ -36,6 +32,7 @@ from tests.app.outputs.broker import Broker, Listener
 from tests.benchmarks.kills import FleetRun, survive_fleet
 from tests.cases import cases
 from tests.skips import program
+from tests.support import as_log, error_of, run_python
 from tests.waiting import LIMIT_S, wait_for
 
 BEGIN, SECOND = 1_767_225_600 * 10**9, 10**9
@@ -61,9 +58,8 @@ def folded(values):
     """The last row of a fold over measurements of one asset, one a second."""
     twin = load_twin("motor_winding")
     t = BEGIN + np.arange(len(values)) * SECOND
-    log = Log.of(twin.model)
-    log.extend(Events(t, t, np.zeros(t.size, np.int8), np.zeros(t.size, np.int32), np.array(values)[:, None]))
-    fold = Fold("kf", twin.model, twin.tuning, log, policy=twin.policy, expected=np.ones(1, np.bool_))
+    log = as_log(Events.alike(READING, t, np.array(values)))
+    fold = twin.fold(log, policy=twin.policy, expected=np.ones(1, np.bool_))
     fold.advance()
     return fold.track.select(fold.n - 1)
 
@@ -248,18 +244,18 @@ def test_the_asset_is_a_level_of_the_topic(tmp_path, group):
 
 @cases(__file__, "fleet_topics.csv")
 def test_topics_that_do_not_name_an_asset_are_one_line(topics, text, tmp_path):
-    with pytest.raises(NisusError) as caught:
-        running(tmp_path, {"type": "mqtt", "host": "127.0.0.1", "port": 1, "topics": json.loads(topics)})
-    assert text in str(caught.value) and "\n" not in str(caught.value) and "pumps.yaml:1" in str(caught.value)
+    source = {"type": "mqtt", "host": "127.0.0.1", "port": 1, "topics": json.loads(topics)}
+    said = error_of(NisusError, running, tmp_path, source)
+    assert text in said and "pumps.yaml:1" in said
 
 
 def test_a_password_that_is_not_set_is_one_line_with_its_place(tmp_path, monkeypatch):
     monkeypatch.delenv("NISUS_NO_SECRET", raising=False)
     more = {"user": "a", "password_env": "NISUS_NO_SECRET"}
-    with pytest.raises(NisusError) as caught:
-        running(tmp_path, {"type": "mqtt", "host": "a", "topics": {"{asset}/t": "winding"}, **more})
+    source = {"type": "mqtt", "host": "a", "topics": {"{asset}/t": "winding"}, **more}
     rule = "is NISUS_NO_SECRET, an environment variable that is not set; set it before the start"
-    assert str(caught.value) == f"{tmp_path / 'pumps.yaml'}:1: source.password_env {rule}"
+    text = f"{tmp_path / 'pumps.yaml'}:1: source.password_env {rule}"
+    assert error_of(NisusError, running, tmp_path, source) == text
     with pytest.raises(NisusError, match="NISUS_NO_SECRET"):  # before anything is compiled
         load_fleet(tmp_path / "pumps.yaml").check_files()
 
@@ -306,11 +302,8 @@ def test_a_fleet_that_was_killed_continues_to_the_same_bits(ending, tmp_path, mo
     monkeypatch.setattr(live, "MAX_PENDING", 1)
     monkeypatch.setattr("sources.tables.follow.PIECE_BYTES", 2**14)
     whole.run()
-    killed = subprocess.run(
-        [sys.executable, "-c", KILLED],
-        cwd=tmp_path, env=os.environ | {"PYTHONPATH": str(ROOT)}, text=True, capture_output=True, timeout=LIMIT_S,
-    )  # fmt: skip
-    assert killed.returncode == -signal.SIGKILL, killed.stderr
+    environment = os.environ | {"PYTHONPATH": str(ROOT)}
+    killed = run_python(KILLED, status=-signal.SIGKILL, cwd=tmp_path, env=environment, timeout=LIMIT_S)
     events = int(killed.stdout.split()[-1])
     again = RunningFleet(load_fleet("pumps.yaml"), lambda *_: None, threads=1, store=tmp_path / "fleet.store")
     before = int(again.table()[2].events.sum())

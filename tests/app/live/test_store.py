@@ -3,7 +3,6 @@
 import asyncio
 import re
 import sqlite3
-import subprocess
 import sys
 import zlib
 from contextlib import closing
@@ -18,10 +17,9 @@ from app.twin.twin import load_twin
 from app.web.readings import stored
 from app.web.running import OpenedTwin, RunningTwin
 from sources.source import ignore
-from tests import ROOT
-from tests.app.scripted import Replayed, Scripted, pull_all, random_walk, readings
+from tests.app.scripted import Replayed, Scripted, notice_texts, pull_all, random_walk, readings
 from tests.benchmarks.kills import survive
-from tests.support import SECOND, assert_same
+from tests.support import SECOND, assert_same, run_python
 from tests.waiting import wait_for
 
 T0 = 1_700_000_000.0  # s; a live source has dates
@@ -61,7 +59,7 @@ class Session:
         self.engine.stop()
 
     def notices(self):
-        return [line.text for line in self.engine.notices.since(0)]
+        return notice_texts(self.engine)
 
 
 def walk(n, begin=0, seed=1):
@@ -364,7 +362,7 @@ session.kill()
 @pytest.mark.skipif(sys.platform == "win32", reason="has no limit of file sizes")
 def test_a_full_disk_is_one_line_and_everything_is_written_once_there_is_room(tmp_path):
     path = tmp_path / "a.store"
-    told = subprocess.run([sys.executable, "-c", FULL, path], cwd=ROOT, capture_output=True, text=True, check=True)
+    told = run_python(FULL, path)
     failed, again = told.stdout.splitlines()
     assert failed.startswith(f"store {path}: ") and "the disk is full" in failed
     assert failed.endswith("the twin goes on without it, and tries again")

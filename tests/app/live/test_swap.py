@@ -21,10 +21,10 @@ from app.views.viser.view import ViserView
 from config.loader import shipped
 from estimators.diagnostics.considered_shares import considered_pairs
 from estimators.diagnostics.references import shown_track
-from estimators.fold import Fold
-from estimators.log import INPUT, READING, TICK, TRUTH, Events, Log, sorted_order
+from estimators.log import INPUT, READING, TICK, TRUTH, Events, sorted_order
 from estimators.registry import ESTIMATORS, unfit
-from tests.app.scripted import Stepped, pull_all
+from tests.app.scripted import Stepped, notice_texts, pull_all
+from tests.support import as_log, folded
 
 EVERY_FILTER = "motor_winding"
 HUGE = ("thermal_field_large",)
@@ -86,8 +86,8 @@ def asset(model, count, seed=0):
 
     compiled = compile_model(model)
     x = model.prior_mean + 0.1 * model.prior_std * rng.standard_normal(model.nx)
-    u = np.array([item.default for item in model.inputs], float)
-    p = np.array([item.value for item in model.parameters], float)
+    u = model.default_inputs
+    p = model.default_parameters
     dt = min(0.5, model.max_step)
     batches, t = [], 0.0
     while sum(map(len, batches)) < count:
@@ -147,12 +147,10 @@ class Running(Stepped):
     def fold(self, name):
         """The whole log, folded from its start with nothing before."""
         if name not in self.cold:
-            log = Log(self.twin.model.width)
-            log.extend(self.events)
+            log = as_log(self.events)
             tuning = self.twin.tuning.with_options(self.twin.options_of(name))
             pairs = np.concatenate((self.twin.pairs, considered_pairs(self.twin.model)))
-            fold = Fold(name, self.twin.model, tuning, log, pairs=pairs, policy=self.engine.policy)
-            fold.advance()
+            fold = folded(name, self.twin.model, log, tuning, pairs=pairs, policy=self.engine.policy)
             self.cold[name] = fold.track
         return self.cold[name]
 
@@ -173,7 +171,7 @@ class Running(Stepped):
         assert history.n and history.base + history.n == self.given
         drawn = shown_track(self.twin.model, pull.track)
         np.testing.assert_array_equal(history.column("mean"), drawn.mean[history.base :])
-        assert "engine error" not in status.counts, [line.text for line in self.engine.notices.since(0)]
+        assert "engine error" not in status.counts, notice_texts(self.engine)
 
     def check_rerun(self, tmp_path):
         """The right side has, under the newest recording, each row once."""

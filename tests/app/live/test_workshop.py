@@ -5,8 +5,6 @@ a fold of the same log that knows nothing of all this.
 """
 
 import os
-import subprocess
-import sys
 import threading
 import time
 from functools import partial
@@ -22,7 +20,6 @@ from app.live.workshop import Workshop
 from app.views.recording.reader import read_recording
 from app.views.recording.writer import Recorder
 from estimators.fold import Fold
-from estimators.log import Log
 from estimators.numerics.cache import cache_folder
 from estimators.numerics.jit import threaded
 from estimators.pieces import LOOP, Piece, is_made, pieces_of
@@ -31,9 +28,9 @@ from estimators.tuning import Tuning
 from sources.pieces import FRAMES
 from tests.app.live.test_engine import reference as cold
 from tests.app.live.test_engine import series
-from tests.app.scripted import MODEL, Scripted, fresh_status, pull_all, readings, row_count, twin
+from tests.app.scripted import MODEL, Scripted, fresh_status, notice_texts, pull_all, readings, row_count, twin
 from tests.app.views.recording.test_parts import refold
-from tests.support import assert_same
+from tests.support import assert_same, measured, run_python
 from tests.waiting import LIMIT_S, wait_for
 
 
@@ -280,7 +277,7 @@ def test_the_engine_says_that_a_compiler_was_ended_and_folds_with_the_filter_all
     wait_for(lambda: row_count(engine) == 50)
     engine.submit(SetEstimator("ukf"))
     killed(tmp_path, Piece("ukf", 0))
-    wait_for(lambda: any("compiled ukf was killed" in line.text for line in engine.notices.since(0)))
+    wait_for(lambda: any("compiled ukf was killed" in text for text in notice_texts(engine)))
     assert engine.folded_with()[1] == "kf" and fresh_status(engine).awaited == "ukf"
     (tmp_path / "go").touch()
     wait_for(lambda: fresh_status(engine).revision == 1)
@@ -345,8 +342,7 @@ def test_nothing_is_left_running(shop, tmp_path):
 def test_the_pieces_are_what_a_fold_compiles():
     threaded()
     interpreted = [name for name, entry in ESTIMATORS.items() if entry.interpreted]
-    log = Log.of(MODEL)
-    log.add(MODEL.sensors[0].name, 0.0, 0.0)
+    log = measured(MODEL, MODEL.sensors[0].name, 0.0, 0.0)
     for name in ("kf", "ukf", interpreted[0]):
         assert Fold(name, MODEL, Tuning.of(MODEL), log).advance() == 1
         assert all(map(is_made, (*pieces_of(LOOP), *pieces_of(name))))
@@ -363,10 +359,7 @@ print(before, [is_made(piece) for piece in pieces_of("kf")])
 
 def test_a_piece_that_one_process_makes_another_finds(tmp_path):
     environment = {key: value for key, value in os.environ.items() if key != "NUMBA_CACHE_DIR"}
-    said = [
-        subprocess.run([sys.executable, "-c", MADE], env=environment | {"XDG_CACHE_HOME": str(tmp_path)}, check=True,
-                       capture_output=True, text=True).stdout.strip()
-        for _ in range(2)
-    ]  # fmt: skip
+    environment["XDG_CACHE_HOME"] = str(tmp_path)
+    said = [run_python(MADE, env=environment).stdout.strip() for _ in range(2)]
     none, one = [False] * 4, [False, False, False, True]
     assert said == [f"{none} {one}", f"{one} {one}"]

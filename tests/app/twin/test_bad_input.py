@@ -22,7 +22,7 @@ from estimators.tuning import Tuning
 from tests import ROOT
 from tests.app.scripted import Replayed, Stepped, pull_all
 from tests.cases import cases
-from tests.support import SECOND
+from tests.support import SECOND, error_of
 
 PATH = ROOT / "config" / "twins" / "motor_winding.yaml"
 
@@ -75,9 +75,8 @@ def with_option(way, name, option, value):
 @pytest.mark.parametrize("value", ["abc", "inf", None, [1], {}])
 def test_an_option_that_is_no_number_is_refused_by_the_api(value):
     engine = Stepped(of=load_twin("motor_winding", overrides={"estimator": "ukf"})).engine
-    with pytest.raises(NisusError) as caught:
-        command_from_json({"command": "SetOption", "name": "alpha", "value": value}, engine)
-    one_line(str(caught.value), "alpha" if isinstance(value, str) else "value")
+    text = error_of(NisusError, command_from_json, {"command": "SetOption", "name": "alpha", "value": value}, engine)
+    one_line(text, "alpha" if isinstance(value, str) else "value")
 
 
 BEYOND = "1" + "0" * 400

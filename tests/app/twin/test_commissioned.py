@@ -10,8 +10,8 @@ import pytest
 from app.twin.log_reader import read_log
 from app.twin.twin import load_twin
 from estimators.diagnostics.episodes import episodes
-from estimators.fold import Fold
 from estimators.log import READING, Log
+from tests.support import folded
 
 RECORDINGS = {
     "motor_bench": ("motor_pmsm_paderborn", "session60_first_30min_2hz.csv"),
@@ -22,8 +22,7 @@ RECORDINGS = {
 
 def of_sensors(twin, log: Log, tuning) -> list:
     """Episodes of sensors that speak, and what they say of them; and that the estimate is lost."""
-    fold = Fold(twin.estimator, twin.model, tuning, log, policy=twin.policy)
-    fold.advance()
+    fold = folded(twin.estimator, twin.model, log, tuning, policy=twin.policy)
     rows = {*twin.model.row_names, *twin.model.sensor_names}
     told = [each for each in episodes(fold) if each.subject in rows or each.cause == "diverged"]
     return [each for each in told if each.cause not in ("silent", "never heard")]
@@ -49,7 +48,7 @@ def test_what_was_normal_hides_no_lost_estimate(data, name, sensor):
     twin = load_twin(name)
     log, _ = read_log(twin, None)
     s = twin.model.sensor_names.index(sensor)
-    own = np.flatnonzero((log.kind[: log.n] == READING) & (log.channel[: log.n] == s))
+    own = log.events.of_sensor(s)
     own = own[own.size // 2 :]
     std = np.sqrt(twin.tuning.r[twin.model.row_start[s]])
     log.value[own, 0] += 100.0 * std * np.random.default_rng(2).choice([-1.0, 1.0], own.size)
@@ -63,8 +62,8 @@ def test_a_change_is_heard_beyond_what_was_normal(data):
     twin = load_twin("motor_bench")
     log, _ = read_log(twin, None)
     s = twin.model.sensor_names.index("yoke")
-    t = (log.t[: log.n] - log.t[0]) * 1e-9
-    rows = np.flatnonzero((log.kind[: log.n] == READING) & (log.channel[: log.n] == s) & (t > 900.0))
+    t = (log.events.t - log.t[0]) * 1e-9
+    rows = np.flatnonzero((log.events.kind == READING) & (log.events.channel == s) & (t > 900.0))
     log.value[rows, 0] += np.random.default_rng(1).normal(0.0, 0.1, rows.size)
     found = of_sensors(twin, log, twin.tuning)
     starts = [each.start - log.t[0] * 1e-9 for each in found if each.subject == "yoke"]
@@ -80,8 +79,8 @@ def test_a_yoke_that_reads_two_degrees_too_high_is_heard_whenever_it_begins(data
     log, _ = read_log(twin, None)
     s = twin.model.sensor_names.index("yoke")
     since = log.t[0] + begin * 1e9
-    wrong = (log.kind[: log.n] == READING) & (log.channel[: log.n] == s) & (log.t[: log.n] >= since)
-    log.value[: log.n][wrong, 0] += 2.0
+    wrong = (log.events.kind == READING) & (log.events.channel == s) & (log.events.t >= since)
+    log.events.value[wrong, 0] += 2.0
     shifted = [each for each in of_sensors(twin, log, twin.tuning) if each.cause == "shifted"]
     assert {each.subject for each in shifted} & {"yoke", "tooth"}
     # In hindsight, an onset may come out as far before the fault as the recording was a little rough there.

@@ -20,6 +20,7 @@ from estimators.model.state_space import Parameter
 from estimators.models import MODELS
 from tests.cases import cases
 from tests.models import write_plant
+from tests.support import error_of, measured
 
 LANDMARKS = {6: (4.0, 1.0), 7: (-3.0, 5.0), 15: (1.0, -6.0)}
 MODEL = """\
@@ -190,9 +191,8 @@ def test_one_line_names_a_column_for_each_member(tmp_path):
 
 @cases(__file__, "wrong_landmarks.csv")
 def test_a_wrong_landmark_is_one_clear_line(folder, overrides, message):
-    with pytest.raises(NisusError, match="^[^\n]*$") as error:
-        load_twin(folder / "one.yaml", overrides=json.loads(overrides)).check_files()
-    assert message in str(error.value)
+    given = json.loads(overrides)
+    assert message in error_of(NisusError, lambda: load_twin(folder / "one.yaml", overrides=given).check_files())
 
 
 def test_landmarks_in_python():
@@ -210,7 +210,6 @@ def test_landmarks_in_python():
         with_landmarks(model, {"range_1": {"1": (2.0,)}})
     known = with_landmarks(model, {"gate": {"a": (2.0,), "b": (5.0,)}})
     assert known.parameters[-1] == Parameter("gate_b_east", "m", 5.0, listed=False)
-    log = Log.of(known)
-    log.add("gate_b", [1.0, 2.0], [1.0, 1.0])
+    log = measured(known, "gate_b", [1.0, 2.0], [1.0, 1.0])
     run = fold("ekf", known, log, R={"gate": 1e-6})
     assert run.mean[-1, 0] == pytest.approx(4.0, abs=0.01)

@@ -6,11 +6,12 @@ import pytest
 from app.twin.log_reader import read_log
 from config.schema import json_schema
 from estimators.diagnostics.score import score
-from estimators.fold import Fold, fold
+from estimators.fold import fold
 from estimators.forecast import forecast
-from estimators.log import READING, Log, truth_of
+from estimators.log import READING, truth_of
 from tests.app.twin.written import refusal, twin_of
 from tests.cases import cases
+from tests.support import as_log, folded
 
 pytestmark = pytest.mark.usefixtures("inside")
 
@@ -103,8 +104,7 @@ def test_a_simulation_whose_time_is_known_is_white_with_it_and_not_without():
     # White noise alone, over the readings: a truth of a temperature at each of them.
     white = twin_of(LASTING.replace(", over: 40 s", "").replace(", error: {std: 2, over: 5 min}", ""))
     readings = log.events.select(log.events.kind == READING)
-    alone = Log(white.model.width)
-    alone.extend(readings._replace(value=readings.value[:, : white.model.width]))
+    alone = as_log(readings._replace(value=readings.value[:, : white.model.width]))
     blind = fold("kf", white.model, white.tuning, alone)
     _, temperature = truth_of(log.events, 0)
     inside = np.abs(blind.mean[:, 0] - temperature) < 1.96 * blind.std[:, 0]
@@ -118,8 +118,7 @@ def test_a_forecast_goes_on_from_what_lasts():
     """What a disturbance of now adds until then is τ (1 - e⁻ᵃ) of it."""
     twin = twin_of(LASTING)
     log, _ = read_log(twin, 100.0)
-    made = Fold("kf", twin.model, twin.tuning, log)
-    made.advance()
+    made = folded("kf", twin.model, log, twin.tuning)
     x, now = made.track.mean[-1], int(log.t[log.n - 1])
     ahead = forecast("kf", twin.model, twin.tuning, made.base_here(), now, 60.0, 1.0).mean[-1]
     moved = x[0] + 60.0 * x[1] + 40.0 * (1.0 - np.exp(-60.0 / 40.0)) * x[2]

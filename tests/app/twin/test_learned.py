@@ -10,6 +10,7 @@ from estimators.errors import ConfigError
 from estimators.models import MODELS
 from tests.app.twin.written import refusal, twin_of
 from tests.cases import cases
+from tests.support import error_of
 
 pytestmark = pytest.mark.usefixtures("inside")
 
@@ -62,9 +63,7 @@ def test_a_twin_without_is_what_it_was():
 @cases(__file__, "learned.csv")
 def test_what_is_wrong_has_its_line(before, after, said):
     assert before in RIGHT
-    with pytest.raises(ConfigError) as caught:
-        corrected(RIGHT.replace(before, after))
-    assert said in str(caught.value) and "\n" not in str(caught.value)
+    assert said in error_of(ConfigError, corrected, RIGHT.replace(before, after))
 
 
 def test_a_file_that_is_not_there():

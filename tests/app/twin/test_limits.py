@@ -16,12 +16,10 @@ from app.live.fold_json import base_from_json, base_to_json
 from app.twin.model import configure
 from app.twin.twin import load_twin
 from estimators.errors import ConfigError
-from estimators.fold import Fold
-from estimators.log import Log
 from estimators.model.parts import Limits, Stuck
-from estimators.tuning import Tuning
 from tests.app.twin.written import refusal, twin_of
 from tests.cases import cases
+from tests.support import folded, measured
 
 pytestmark = pytest.mark.usefixtures("inside")
 
@@ -124,10 +122,8 @@ REASON_SECONDS = {"duplicate": 1, "range": 2, "rate": 3}
 
 def test_counts_and_lines_name_sensor_value_and_rule():
     twin = twin_of(limited("range: [-40, 180]\n    rate: 5"))
-    log = Log.of(twin.model)
-    log.add("winding", [0, 1, 1, 2, 3], [30, 30, 30, 500, 60])
-    fold = Fold("kf", twin.model, Tuning.of(twin.model), log)
-    fold.advance()
+    log = measured(twin.model, "winding", [0, 1, 1, 2, 3], [30, 30, 30, 500, 60])
+    fold = folded("kf", twin.model, log)
     found = list(rejections(twin.model, log, fold.track, 0))
     lines = {key: text for key, text, _ in found}
     assert {key: t for key, _, t in found} == {f"{what} winding": k * 10**9 for what, k in REASON_SECONDS.items()}
@@ -143,10 +139,8 @@ def test_counts_and_lines_name_sensor_value_and_rule():
 
 def test_a_base_keeps_what_the_screen_remembers():
     twin = twin_of(limited("rate: 5"))
-    log = Log.of(twin.model)
-    log.add("winding", np.arange(100.0), np.full(100, 30.0))
-    fold = Fold("kf", twin.model, Tuning.of(twin.model), log)
-    fold.advance()
+    log = measured(twin.model, "winding", np.arange(100.0), np.full(100, 30.0))
+    fold = folded("kf", twin.model, log)
     base = fold.base_at(100)[1]
     again = base_from_json(base_to_json(base))
     assert again is not None and base.edge is not None and again.edge is not None

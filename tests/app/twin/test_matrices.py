@@ -1,5 +1,6 @@
 """Twins whose model is a file of matrices: the same estimates as the model in Python, and one line for each fault."""
 
+import re
 from pathlib import Path
 
 import numpy as np
@@ -11,6 +12,7 @@ from config.loader import moved
 from estimators.errors import NisusError
 from estimators.fold import fold
 from estimators.log import INPUT, READING, Events, Log
+from tests.support import error_of
 
 PYTHON = """\
 from estimators.model import Input, Noise, Row, Sensor, State, StateSpaceModel
@@ -142,9 +144,7 @@ def test_the_file_is_read_again_and_found_from_a_copy(tmp_path):
 )  # fmt: skip
 def test_every_fault_is_one_line(tmp_path, given, says):
     (tmp_path / "cart.txt").write_text("")
-    with pytest.raises(NisusError, match=says) as caught:
-        twin(tmp_path, **given)
-    assert "\n" not in str(caught.value)
+    assert re.search(says, error_of(NisusError, twin, tmp_path, **given))
 
 
 @pytest.mark.parametrize(
@@ -158,6 +158,4 @@ def test_every_fault_is_one_line(tmp_path, given, says):
 def test_files_that_cannot_be_read(tmp_path, name, content, says):
     twin(tmp_path, file=name)
     (tmp_path / name).write_bytes(content)
-    with pytest.raises(NisusError, match=says) as caught:
-        load_twin(str(tmp_path / "cart.yaml"))
-    assert "\n" not in str(caught.value)
+    assert re.search(says, error_of(NisusError, load_twin, str(tmp_path / "cart.yaml")))

@@ -21,6 +21,7 @@ from estimators.log import READING, TRUTH, Log
 from estimators.models import MODELS
 from tests.app.twin.written import refusal, twin_of
 from tests.cases import cases
+from tests.support import measured
 
 ROVER = """\
 model: pair.py:Pair
@@ -80,8 +81,7 @@ def correlated(matrix):
 def test_correlated_rows_make_a_full_r():
     """The first posterior of a prior N(m, P) at R = [[1, 1], [1, 4]], by the equations of the Kalman filter."""
     twin = twin_of(correlated("[[1, 0.5], [0.5, 1]]"))
-    log = Log.of(twin.model, start=0.0)
-    log.add("fix", [0.0], [[3.0, -1.0]])
+    log = measured(twin.model, "fix", [0.0], [[3.0, -1.0]], start=0.0)
     track = fold("kf", twin.model, twin.tuning, log)
     m, P, R = np.array([1.0, 0.0]), np.diag([4.0, 1.0]), np.array([[1.0, 1.0], [1.0, 4.0]])
     K = P @ np.linalg.inv(P + R)
@@ -123,8 +123,7 @@ def test_a_sensor_without_noise_and_a_state_that_is_certain():
     """x is known to be 1 at first and stays so, as it is not driven; y is what the sensor reads, exactly."""
     text = ROVER.replace("[1, 2]", "[1, 0]").replace("std: 2}", "std: 0}") + "noise:\n  x: {std: 0}\n"
     twin = twin_of(text)
-    log = Log.of(twin.model, start=0.0)
-    log.add("fix", [0.0, 1.0], [[3.0, -1.0], [5.0, 2.5]])
+    log = measured(twin.model, "fix", [0.0, 1.0], [[3.0, -1.0], [5.0, 2.5]], start=0.0)
     track = fold("kf", twin.model, twin.tuning, log)
     np.testing.assert_allclose(track.mean, [[1.0, -1.0], [1.0, 2.5]], atol=1e-12)
     np.testing.assert_allclose(track.std, 0.0, atol=1e-9)
@@ -168,8 +167,7 @@ def test_a_log_likelihood_is_not_asked_about_readings_without_noise():
     pair = PAIR.replace("def Pair", likely + "def Pair").replace("h=h)", "h=h, log_likelihood=likely)")
     Path("pair.py").write_text(pair)
     twin = twin_of(ROVER.replace("[1, 2]", "[0, 2]"))
-    log = Log.of(twin.model, start=0.0)
-    log.add("fix", [0.0], [[3.0, -1.0]])
+    log = measured(twin.model, "fix", [0.0], [[3.0, -1.0]], start=0.0)
     assert fold("kf", twin.model, twin.tuning, log).mean[-1, 0] == pytest.approx(3.0)
 
 

@@ -8,7 +8,7 @@ import pytest
 from app.twin.twin import load_twin
 from config.loader import TWINS, shipped
 from estimators.diagnostics.episodes import episodes_of, judged_rows
-from estimators.fold import Fold, fold
+from estimators.fold import fold
 from estimators.log import READING, truth_of
 from estimators.track import GATED, USED
 from tests.skips import recorded
@@ -19,7 +19,7 @@ from tests.support import SECOND, as_log, read_all
 def folded(name):
     """Return the fold of a twin's own log, as the twin runs."""
     twin, log = recorded(name)
-    fold = Fold(twin.estimator, twin.model, twin.tuning, log, policy=twin.policy, expected=twin.expected)
+    fold = twin.fold(log, policy=twin.policy, expected=twin.expected)
     fold.advance()
     return fold
 

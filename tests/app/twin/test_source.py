@@ -11,7 +11,7 @@ from estimators.log import INPUT, READING, TRUTH, Events
 from estimators.models import MODELS
 from tests.app.twin.written import refusal, twin_of
 from tests.cases import cases
-from tests.support import read_all
+from tests.support import error_of, read_all
 
 DBC = """\
 VERSION ""
@@ -73,9 +73,7 @@ def of(batch, kind):
 
 
 def message(text, kind, **options):
-    with pytest.raises(kind) as caught:
-        events(twin_of(text, **options))
-    return str(caught.value)
+    return error_of(kind, lambda: events(twin_of(text, **options)))
 
 
 def test_a_can_log_is_read_through_its_dbc_and_conditions():
@@ -350,9 +348,7 @@ def test_a_virtual_bus_plays_its_own_asset():
     ],
 )
 def test_what_has_no_asset_cannot_play_one(text, expected):
-    with pytest.raises(SourceError) as caught:
-        twin_of(text).plan.player(lambda key, text: None)
-    assert str(caught.value) == expected
+    assert error_of(SourceError, twin_of(text).plan.player, lambda key, text: None) == expected
 
 
 def test_a_truth_of_another_model_must_fit():
@@ -443,11 +439,11 @@ def test_disorder_in_one_file_of_a_merged_source_alters_no_other(how):
     log, counts = read_log(twin_of(THREE), None)
     assert counts["stale"] == 0 and log.n == 3 * seconds.size
     for k, name in enumerate(("winding", "tooth", "yoke")):
-        own = log.channel[: log.n] == k
+        own = log.events.channel == k
         if name != "tooth":
-            assert log.value[: log.n][own, 0].tolist() == list(range(seconds.size))
-            np.testing.assert_array_equal(log.t[: log.n][own], np.round((seconds + 0.1) * 1e3).astype(np.int64) * 10**6)
+            assert log.events.value[own, 0].tolist() == list(range(seconds.size))
+            np.testing.assert_array_equal(log.events.t[own], np.round((seconds + 0.1) * 1e3).astype(np.int64) * 10**6)
         elif how == "set back an hour":
-            np.testing.assert_allclose(log.t[: log.n][own] * 1e-9, seconds, atol=0.5)
+            np.testing.assert_allclose(log.events.t[own] * 1e-9, seconds, atol=0.5)
         elif how != "set ahead for a while":  # which its file alone does not distinguish from a gap
-            np.testing.assert_allclose(log.t[: log.n][own] * 1e-9, np.sort(stepped(seconds, how)))
+            np.testing.assert_allclose(log.events.t[own] * 1e-9, np.sort(stepped(seconds, how)))

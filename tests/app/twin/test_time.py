@@ -11,11 +11,10 @@ from app.ingest import Ingest
 from app.twin.log_reader import read_log
 from app.twin.twin import load_twin
 from estimators.errors import ConfigError
-from estimators.fold import Fold
 from estimators.log import MAINTENANCE, TICK
 from estimators.track import STALE
 from tests.app.scripted import Stepped, pull_all, readings
-from tests.support import as_log
+from tests.support import as_log, folded
 
 TWIN = """
 model: motor_winding
@@ -105,11 +104,10 @@ def test_inputs_are_unknown_over_a_pause(tmp_path):
     """A logger that was off from 50 to 400 s: what a cell was drained of meanwhile is not in the file."""
     times = *range(51), *range(400, 420)
     _, log, counts = paused(tmp_path, times, 400)
-    assert not np.any(log.kind[: log.n] == MAINTENANCE) and counts["paused"] == 0
+    assert not np.any(log.events.kind == MAINTENANCE) and counts["paused"] == 0
     twin, log, counts = paused(tmp_path, times, 60)
-    fold = Fold(twin.estimator, twin.model, twin.tuning, log)
-    fold.advance()
-    rows = np.flatnonzero(log.kind[: log.n] == MAINTENANCE)
+    fold = folded(twin.estimator, twin.model, log, twin.tuning)
+    rows = np.flatnonzero(log.events.kind == MAINTENANCE)
     assert log.t[rows].tolist() == [400_000_000_000 - 1] * 3
     assert [twin.model.state_names[k] for k in log.channel[rows]] == ["soc", "v1", "temperature"]
     np.testing.assert_allclose(fold.track.std[rows[-1], :3], [0.2, 0.02, 3.0], rtol=1e-12)
@@ -130,10 +128,10 @@ def test_a_logger_of_one_row_a_minute_does_not_pause_all_the_time(tmp_path):
     """
     twin, log, counts = paused(tmp_path, [*range(0, 1830, 61), 2230, 2291], 60)
     assert (twin.policy.degraded_after, twin.policy.stale_after) == (183.0, 732.0)
-    rows = np.flatnonzero(log.kind[: log.n] == MAINTENANCE)
+    rows = np.flatnonzero(log.events.kind == MAINTENANCE)
     # Of the first row nothing is usual yet.
     assert counts["paused"] == 2 and set(log.t[rows].tolist()) == {61_000_000_000 - 1, 2_230_000_000_000 - 1}
-    events = log.events.select(log.kind[: log.n] != MAINTENANCE)
+    events = log.events.select(log.events.kind != MAINTENANCE)
     said = []
     ingest = Ingest(twin.model, 0, lambda key, text: said.append((key, text)), unknown=twin.unknown_inputs)
     for k in range(0, len(events), 7):
@@ -159,12 +157,10 @@ def test_a_gap_has_rows_of_the_prediction_and_changes_no_other(tmp_path, gap, de
     replayed = Stepped()  # degraded after 5 s
     replayed.put(readings(times, np.full(len(times), 40.0)))
     assert (pull_all(replayed.engine).events.kind == TICK).sum() == (20 if gap > 10 else 0)
-    fold = Fold(twin.estimator, twin.model, twin.tuning, log, policy=twin.policy)
-    fold.advance()
-    rows = log.kind[: log.n] == TICK
+    fold = folded(twin.estimator, twin.model, log, twin.tuning, policy=twin.policy)
+    rows = log.events.kind == TICK
     assert rows.sum() == ticks and log.n == len(times) + ticks
-    alone = Fold(twin.estimator, twin.model, twin.tuning, as_log(log.events.select(~rows)), policy=twin.policy)
-    alone.advance()
+    alone = folded(twin.estimator, twin.model, as_log(log.events.select(~rows)), twin.tuning, policy=twin.policy)
     for name in ("mean", "std", "nis", "innovation", "whitened"):
         np.testing.assert_array_equal(getattr(fold.track, name)[~rows], getattr(alone.track, name), err_msg=name)
     if ticks:

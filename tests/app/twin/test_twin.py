@@ -11,6 +11,7 @@ from estimators.compiled.model import compile_model
 from estimators.errors import ConfigError, ModelError
 from tests.app.twin.written import refusal, twin_of
 from tests.cases import cases
+from tests.support import error_of
 
 pytestmark = pytest.mark.usefixtures("inside")
 
@@ -154,9 +155,7 @@ def test_a_model_file_that_fails_is_one_line_in_the_users_code(python, reference
 def test_a_model_whose_shapes_disagree_is_refused_when_compiled():
     Path("pump.py").write_text(PUMP.replace("out[0] = 0.9 * x[0]", "out[0] = x[0] + x[1]"))
     twin = twin_of("model: ./pump.py:Pump\nsource: {type: simulator}\n")
-    with pytest.raises(ModelError) as caught:
-        compile_model(twin.model)
-    assert str(caught.value).startswith("pump.py:5: model pump: ") and "\n" not in str(caught.value)
+    assert error_of(ModelError, compile_model, twin.model).startswith("pump.py:5: model pump: ")
 
 
 def test_a_twin_is_restored_from_its_text_alone():

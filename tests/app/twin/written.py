@@ -2,10 +2,9 @@
 
 from pathlib import Path
 
-import pytest
-
 from app.twin.twin import Twin, load_twin
 from estimators.errors import ConfigError, NisusError
+from tests.support import error_of
 
 
 def twin_of(text: str, **options: object) -> Twin:
@@ -16,7 +15,4 @@ def twin_of(text: str, **options: object) -> Twin:
 
 def refusal(text: str, kind: type[NisusError] = ConfigError, **options: object) -> str:
     """The one line with which a YAML text is refused."""
-    with pytest.raises(kind) as caught:
-        twin_of(text, **options)
-    assert "\n" not in str(caught.value)
-    return str(caught.value)
+    return error_of(kind, twin_of, text, **options)

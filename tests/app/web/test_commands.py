@@ -13,6 +13,7 @@ from app.twin.twin import load_twin
 from app.web.commands_json import command_from_json
 from estimators.errors import NisusError
 from tests.cases import cases
+from tests.support import error_of
 
 KINDS = typing.get_args(commands.Command)
 ODD = (
@@ -31,9 +32,7 @@ def engine():
 
 def answer(engine, body):
     """The line with which a command is refused."""
-    with pytest.raises(NisusError) as refused:
-        command_from_json(body, engine)
-    return str(refused.value)
+    return error_of(NisusError, command_from_json, body, engine)
 
 
 @cases(__file__, "refused_commands.csv")

@@ -13,6 +13,7 @@ from app.web.http import get, parse, post
 from app.web.streams import PageMessage
 from estimators.errors import ConfigError
 from estimators.models import MODELS
+from tests.support import error_of
 
 
 def answer(route, body=b"", query=""):
@@ -75,6 +76,6 @@ def test_a_query_becomes_arguments():
     ids=str,
 )  # fmt: skip
 def test_a_chart_query_that_breaks_a_rule_is_refused(body):
-    with pytest.raises(ConfigError, match="^stream x: .*") as refused:
-        ChartStream("x", parse(ChartQuery, body, "stream x"), columns_of(MODELS["motor_winding"]))
-    assert "\n" not in str(refused.value)
+    columns = columns_of(MODELS["motor_winding"])
+    text = error_of(ConfigError, lambda: ChartStream("x", parse(ChartQuery, body, "stream x"), columns))
+    assert text.startswith("stream x: ")

@@ -11,13 +11,12 @@ import pytest
 from app.cli.push import Rows
 from app.twin.twin import load_twin
 from estimators import fold
-from estimators.log import Log
 from sources.messages import Messages, SentNumbers
 from sources.source import Accuracy, Channel, Condition, ignore
 from sources.tables.text import TextMatch
 from tests.app.served import ServedEngine
 from tests.cases import cases
-from tests.support import SECOND
+from tests.support import SECOND, measured
 from tests.waiting import LIMIT_S, wait_for
 
 BEGIN = 1_767_225_600 * SECOND  # 2026-01-01T00:00:00Z
@@ -75,8 +74,7 @@ def test_the_published_state_is_that_of_the_fold_whatever_the_form(page):
             stream.write_table(table)
         assert sent(page, sink.getvalue().to_pybytes(), ARROW)[1]["accepted"] == 10
     twin = page.engine.twin
-    log = Log.of(twin.model, start=BEGIN * 1e-9)
-    log.add("winding", BEGIN * 1e-9 + np.arange(40.0), values)
+    log = measured(twin.model, "winding", BEGIN * 1e-9 + np.arange(40.0), values, start=BEGIN * 1e-9)
     track = fold(twin.estimator, twin.model, log, tuning=twin.tuning)
     wait_for(lambda: page.get("/api/state")["time_ns"] == BEGIN + 39 * SECOND)
     (temperature, rate) = page.get("/api/state")["states"]

@@ -12,10 +12,10 @@ from app.studies.baseline import ComparedFigure
 from app.studies.guard import GuardVerdict, keep_last
 from app.twin.twin import load_twin
 from config.loader import TWINS
-from estimators.fold import Fold
 from estimators.tuning import Tuning
 from tests.app.scripted import MODEL
 from tests.cases import cases
+from tests.support import folded
 from tests.waiting import wait_for
 
 FIRST = Tuning.of(MODEL)
@@ -152,8 +152,7 @@ def test_a_run_is_kept_and_loaded_again(twin_page, tmp_path):
     np.testing.assert_array_equal(status.tuning.q, twin.tuning.q)
     np.testing.assert_array_equal(status.tuning.r, [0.5])
     # The same fold as that of the command line.
-    fold = Fold("kf", twin.model, twin.tuning, twin_page.engine._log.copy(), policy=twin.policy)
-    fold.advance()
+    fold = folded("kf", twin.model, twin_page.engine._log.copy(), twin.tuning, policy=twin.policy)
     np.testing.assert_array_equal(twin_page.engine._fold.track.mean, fold.track.mean)
     assert twin_page.get("/api/runs")[-1]["what"].startswith("version quiet: ")
     # And back to what the file says.

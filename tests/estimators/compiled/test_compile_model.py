@@ -13,6 +13,7 @@ from estimators.errors import ModelError
 from estimators.model.state_space import Input, Noise, Parameter, Row, Sensor, State, StateSpaceModel
 from tests.estimators.compiled.test_jacobians import F, H, P, U, f, h, model
 from tests.models import first_state, first_state_squared, unchanged
+from tests.support import error_of
 
 NOT_COMPILABLE = {"a": 1}
 
@@ -148,9 +149,7 @@ def test_it_is_said_of_the_line_in_the_models_file(function, culprit, line, monk
     code = culprit.__code__
     place = f"{code.co_filename}:{code.co_firstlineno + line}: model curved: f "
     monkeypatch.chdir(tmp_path)
-    with pytest.raises(ModelError) as refused:
-        compile_model(model(f=function))
-    assert str(refused.value).startswith(place)
+    assert error_of(ModelError, compile_model, model(f=function)).startswith(place)
 
 
 @pytest.mark.parametrize(
@@ -170,9 +169,8 @@ def test_it_is_said_of_the_line_in_the_models_file(function, culprit, line, monk
     ],
 )
 def test_declarations_that_no_filter_could_run(changes, says):
-    with pytest.raises(ModelError, match="model curved: ") as refused:
-        model(**changes)
-    assert says in str(refused.value)
+    text = error_of(ModelError, model, **changes)
+    assert "model curved: " in text and says in text
 
 
 def test_compiled_functions_say_what_the_plain_ones_say():

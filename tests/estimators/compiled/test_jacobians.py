@@ -6,13 +6,13 @@ import pytest
 from estimators.compiled.jacobians import ANALYTIC, CENTRAL, COMPLEX_STEP, complex_step, scratch_size
 from estimators.compiled.model import compile_model
 from estimators.fold import fold
-from estimators.log import READING, Log
+from estimators.log import READING
 from estimators.model.state_space import Input, Noise, Parameter, Row, Sensor, State, StateSpaceModel
 from estimators.models import MODELS
 from estimators.numerics.jit import jit
 from estimators.track import FAILED
 from estimators.tuning import Tuning
-from tests.support import folded, log_of
+from tests.support import folded, log_of, measured
 
 
 def f(x, u, p, dt, out):
@@ -200,7 +200,6 @@ def test_a_derivative_that_divides_by_zero_ends_no_fold():
     target = compile_model(model).static["h_complex"][0]
     complex_step(target, True, np.array([1.0, 0.0]), np.empty(0), np.empty(0), 0.0, H, np.empty(scratch_size(2, 1)))
     assert np.isnan(H[0, 0])
-    log = Log.of(model, start=0.0)
-    log.add("share", [1.0, 2.0], [0.5, 0.5])
+    log = measured(model, "share", [1.0, 2.0], [0.5, 0.5], start=0.0)
     verdicts = fold("ekf", model, Tuning.of(model), log).verdict
     assert verdicts.tolist() == [FAILED, FAILED]

@@ -20,9 +20,7 @@ def events(t, arrival=None, kind=READING, channel=0):
     """Events whose value is their number, so that each can be found again."""
     t = np.round(np.asarray(t, float) * SECOND).astype(np.int64)
     arrival = t.copy() if arrival is None else np.round(np.asarray(arrival, float) * SECOND).astype(np.int64)
-    n = t.size
-    value = np.arange(n, dtype=float).reshape(n, 1)
-    return Events(t, arrival, np.full(n, kind, np.int8), np.broadcast_to(np.int32(channel), n).copy(), value)
+    return Events.alike(kind, t, np.arange(t.size, dtype=float), channel)._replace(arrival=arrival)
 
 
 class Outcome:
@@ -42,11 +40,11 @@ class Outcome:
 
     @property
     def numbers(self):
-        return self.log.value[: self.log.n, 0]
+        return self.log.events.value[:, 0]
 
     @property
     def seconds(self):
-        return self.log.t[: self.log.n] / SECOND
+        return self.log.events.t / SECOND
 
     def told(self):
         log = self.log
@@ -137,7 +135,7 @@ def test_sensors_of_one_clock_keep_their_times_to_each_other():
     made = Outcome(events(t - np.where(t >= 400.0, 300.0, 0.0), channel=sensor))
     assert not made.refused and not made.stale and len(made.moved) == 2
     true = np.round(t * SECOND).astype(np.int64)[made.numbers.astype(int)]
-    late = made.log.t[: made.log.n] - true
+    late = made.log.events.t - true
     assert np.all(late[:100] == 0) and np.ptp(late[true > 400 * SECOND]) == 0
 
 
@@ -204,7 +202,7 @@ def test_inputs_that_change_seldom_are_no_jumps():
     stream = Events.concat([readings, inputs], 1)
     stream = stream.select(np.argsort(stream.t, kind="stable"))
     made = Outcome(stream)
-    np.testing.assert_array_equal(made.log.t[: made.log.n], stream.t)
+    np.testing.assert_array_equal(made.log.events.t, stream.t)
 
 
 def test_a_wrong_row_of_a_table_is_refused_whole():
@@ -315,7 +313,7 @@ def test_a_clock_that_drifts_makes_no_other_sender_late():
     found = Outcome(events(stamp, true + DELAY, channel=np.tile([0, 1], t.size)), utc=True)
     off = found.seconds - true[found.numbers.astype(int)]
     assert (found.stale, found.refused, len(found.moved)) == (0, [], 3)
-    assert np.all(off[found.log.channel[: found.log.n] == 0] == 0) and -0.01 < off.min() and off.max() < 1.011
+    assert np.all(off[found.log.events.channel == 0] == 0) and -0.01 < off.min() and off.max() < 1.011
 
 
 @pytest.mark.parametrize("alone", [0.0, 10.0])

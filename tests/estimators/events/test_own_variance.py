@@ -15,7 +15,7 @@ from estimators.registry import ESTIMATORS, unfit
 from estimators.tuning import Tuning
 from tests.estimators.linear_models import random_linear
 from tests.estimators.test_fold import in_python
-from tests.support import SECOND, assert_same
+from tests.support import SECOND, as_log, assert_same, folded, measured
 
 PLAIN = random_linear(np.random.default_rng(5), 3, 2).model
 COARSE, FINE = (4.0, 9.0), (0.25, 0.04)
@@ -76,8 +76,7 @@ def test_the_same_bits_as_a_sensor_tuned_to_it(name, monkeypatch):
     # What is judged of them, with how many sensors there are, is not the filter's.
     assert_same(track._replace(**dict.fromkeys(JUDGED)), expected._replace(**dict.fromkeys(JUDGED)))
     # And it matters: with the coarse variances alone the estimate is another.
-    plain = Log.of(MODEL)
-    plain.extend(own.events._replace(value=own.events.value[:, : MODEL.width]))
+    plain = as_log(own.events._replace(value=own.events.value[:, : MODEL.width]))
     assert not np.allclose(fold(name, MODEL, tuning, plain).mean, expected.mean, rtol=1e-3)
 
 
@@ -100,7 +99,7 @@ def test_a_row_without_its_own_keeps_the_tuned_one():
     """NaN beside a number: R = diag(own, tuned), by the equations of the Kalman filter."""
     log = Log.of(MODEL, start=1.0)
     log.add("coarse", 1.0, [[0.5, -0.3]], variance=[[0.01, np.nan]])
-    track = fold("kf", MODEL, Tuning.of(MODEL), log)
+    track = folded("kf", MODEL, log).track
     matrices = random_linear(np.random.default_rng(5), 3, 2)
     P, H, R = np.diag(matrices.std**2), matrices.H[1], np.diag([0.01, COARSE[1]])
     S = H @ P @ H.T + R
@@ -110,8 +109,7 @@ def test_a_row_without_its_own_keeps_the_tuned_one():
 
 
 def test_memory_only_where_it_is_used():
-    log = Log.of(MODEL, capacity=100)
-    log.add("coarse", [1.0, 2.0], np.zeros((2, 2)))
+    log = measured(MODEL, "coarse", [1.0, 2.0], np.zeros((2, 2)), capacity=100)
     assert log.value.shape == (100, MODEL.width)
     log.add("coarse", 1.5, np.zeros((1, 2)), variance=2.0)
     assert log.value.shape[1] == MODEL.width + MODEL.ny and log.n == 3
@@ -127,7 +125,7 @@ def test_filters_that_hold_on_to_one_r_say_so():
     log.add("second", 1.0, [[0.0, 0.0]], variance=1.0)
     with pytest.raises(EstimatorError, match="adapt learns one R of each sensor; set adapt to off or Q"):
         fold("ekf", PLAIN, Tuning.of(PLAIN).with_options({"adapt": 1.0}), log)
-    fold("ekf", PLAIN, Tuning.of(PLAIN).with_options({"adapt": 2.0}), log)
+    folded("ekf", PLAIN, log, options={"adapt": 2.0})
     winding = MODELS["motor_winding"]
     log = Log.of(winding)
     growing = Fold("kf-steady", winding, Tuning.of(winding), log)

@@ -28,7 +28,7 @@ from estimators.track import Track
 from estimators.tuning import Tuning
 from tests.benchmarks.recovery import CASES, recover
 from tests.models import level_model
-from tests.support import folded
+from tests.support import folded, measured
 
 DECADES = 2.0 * np.log(10.0)
 """Deviation of the weak belief in a variance."""
@@ -59,9 +59,7 @@ def simulated(seed: int, n: int, q: float = 0.2, r: float = 0.5, rate: float = 0
 
 
 def log_of(ys: np.ndarray) -> Log:
-    log = Log.of(MODEL)
-    log.add("float", np.arange(ys.size, dtype=float), ys)
-    return log
+    return measured(MODEL, "float", np.arange(ys.size, dtype=float), ys)
 
 
 def objective_of(log: Log, *wanted: str, tuning: Tuning | None = None, **given: Any) -> Objective:

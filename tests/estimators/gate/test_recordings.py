@@ -101,7 +101,7 @@ OFFICE = level_model(
 
 def locked_out(growing):
     """Hours of the longest stretch in which every reading was refused."""
-    t, longest, begun = growing.log.t[: growing.n] / 3.6e12, 0.0, None
+    t, longest, begun = growing.events.t / 3.6e12, 0.0, None
     for now, verdict in zip(t, growing.track.verdict, strict=True):
         begun = (now if begun is None else begun) if verdict == GATED else None
         longest = max(longest, 0.0 if begun is None else now - begun)
@@ -124,7 +124,7 @@ def test_an_office_that_changes_its_level_is_followed(data):
     for growing in folds:
         growing.advance()
     assert locked_out(folds[0]) > 48.0 and locked_out(folds[1]) < 24.0
-    errors = [np.sqrt(np.mean((growing.track.mean[:, 0] - log.value[: log.n, 0]) ** 2)) for growing in folds]
+    errors = [np.sqrt(np.mean((growing.track.mean[:, 0] - log.events.value[:, 0]) ** 2)) for growing in folds]
     assert errors[1] < 0.85 * errors[0]
     outcomes = [decision.outcome for decision in folds[1].decisions]
     assert outcomes.count("believed") > 5 * outcomes.count("isolated")

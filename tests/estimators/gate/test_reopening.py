@@ -39,7 +39,7 @@ def test_a_sensor_that_jumps_is_isolated(name):
     assert isolated.sensor == "a" and JUMP < isolated.time < JUMP + 1.0
     assert isolated.witnesses == 1 and isolated.evidence < -np.log(1000.0)
     assert abs(growing.track.mean[-1, 0]) < 1.0
-    after = (growing.log.channel[: growing.n] == 0) & (growing.log.t[: growing.n] >= JUMP * SECOND)
+    after = (growing.events.channel == 0) & (growing.events.t >= JUMP * SECOND)
     assert not np.any(growing.track.verdict[after] == USED)
 
 
@@ -49,7 +49,7 @@ def test_an_asset_that_jumps_is_followed(name):
     assert outcomes(growing) == ["doubted", "reopened"]
     reopened = growing.decisions[1]
     assert JUMP < reopened.time < JUMP + 1.0 and reopened.evidence > np.log(1000.0)
-    late = growing.log.t[: growing.n] > (JUMP + 1.0) * SECOND
+    late = growing.events.t > (JUMP + 1.0) * SECOND
     assert not np.any(growing.track.verdict[late] == GATED)
     # The level's own walk: 0.01 m in a root second, over 60 s.
     assert abs(growing.track.mean[-1, 0] - 5.0) < 4 * 0.01 * np.sqrt(60.0) + 0.1
@@ -254,7 +254,7 @@ def test_swapped_landmarks_are_named_and_never_accepted():
 def test_an_estimate_that_most_sensors_contradict_is_the_suspect():
     growing = ranges(jump=5.0)
     assert outcomes(growing)[-1] == "reopened" and growing.decisions[-1].time < JUMP + 3.0
-    late = growing.log.t[: growing.n] > (JUMP + 3.0) * SECOND
+    late = growing.events.t > (JUMP + 3.0) * SECOND
     assert np.all(growing.track.verdict[late] == USED) and abs(growing.track.mean[-1, 0] - 5.0) < 0.2
 
 

@@ -67,12 +67,11 @@ def log_of(steps=40):
     log = Log(2)
     for k in range(steps):
         channel = k % 2
-        value = np.full((1, 2), np.nan)
-        value[0, : channel + 1] = rng.normal(2.0, 0.5, channel + 1)
+        value = rng.normal(2.0, 0.5, channel + 1)
         if k == 11:
-            value[0, 0] = np.nan  # one row of two is missing
-        t = np.array([int(k * STEP * SECOND)])
-        log.extend(Events(t, t.copy(), np.array([READING], np.int8), np.array([channel], np.int32), value))
+            value[0] = np.nan  # one row of two is missing
+        t = int(k * STEP * SECOND)
+        log.extend(Events.one(t, t, READING, channel, value, 2))
     return log
 
 

@@ -4,10 +4,8 @@ import numpy as np
 import pytest
 from scipy.optimize import least_squares
 
-from estimators.fold import fold
 from estimators.log import READING
 from estimators.track import FAILED
-from estimators.tuning import Tuning
 from tests.estimators.gaussian.test_square_root import EVERYTHING
 from tests.estimators.interpreted.test_filterpy import P0, PENDULUM, X0, log  # noqa: F401  the fixture
 from tests.models import complex_step, first_state_squared, level_model
@@ -18,8 +16,8 @@ from tests.support import assert_same, folded, log_of
 @pytest.mark.parametrize("options", EVERYTHING, ids=str)
 def test_one_iteration_is_the_ekf_to_the_bit(log, options, joseph):  # noqa: F811
     options = {**options, "joseph": joseph}
-    once = fold("iekf", PENDULUM, Tuning.of(PENDULUM).with_options({**options, "iterations": 1}), log)
-    ekf = fold("ekf", PENDULUM, Tuning.of(PENDULUM).with_options(options), log)
+    once = folded("iekf", PENDULUM, log, options={**options, "iterations": 1}).track
+    ekf = folded("ekf", PENDULUM, log, options=options).track
     assert_same(once, ekf)
 
 
@@ -38,7 +36,7 @@ def test_many_iterations_find_the_mode_and_count_the_reading_once(sensor, y):
     best = least_squares(residuals, X0, xtol=1e-15, ftol=1e-15, gtol=1e-15).x
     H = complex_step(lambda x, out: h(x, [], [], out), best, len(rows))[finite]
     mean, cov = folded("iekf", PENDULUM, readings, options={"iterations": 20}).moments()
-    assert np.max(np.abs(best - fold("ekf", PENDULUM, Tuning.of(PENDULUM), readings).mean[0])) > 1e-2
+    assert np.max(np.abs(best - folded("ekf", PENDULUM, readings).track.mean[0])) > 1e-2
     # scipy stops when its gradient is 1e-15 of its size at the start: the mode is good to about 1e-8.
     np.testing.assert_allclose(mean, best, rtol=0, atol=1e-7)
     np.testing.assert_allclose(cov, np.linalg.inv(np.diag(1 / P0) + H.T @ np.diag(1 / r) @ H), rtol=0, atol=1e-7)
@@ -65,6 +63,6 @@ def cliff(x, u, p, out):
 def test_an_iteration_that_leaves_the_model_fails_visibly():
     """y = log x from 1 ± 10, reading -3: the first step leads to -1.9, where there is no logarithm."""
     model = level_model({"y": 1.0}, 1.0, state="x", mean=1.0, std=10.0, h=cliff)
-    track = fold("iekf", model, Tuning.of(model), log_of(1, (0, READING, -3.0)))
+    track = folded("iekf", model, log_of(1, (0, READING, -3.0))).track
     assert track.verdict[0] == FAILED
     assert (track.mean[0, 0], track.std[0, 0]) == (1.0, 10.0)

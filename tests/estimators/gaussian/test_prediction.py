@@ -170,7 +170,7 @@ def test_after_a_clock_jump_the_estimate_is_the_prior():
     later = [(just, TICK, []), (just + 1, TICK, []), (1_700_000_000, INPUT, [0, 0, 0, 40, 25])]
     log = log_of(model.width, (0, READING, 90.0), *later)
     track = fold("ekf", model, Tuning.of(model), log)
-    prior = np.array([state.mean for state in model.states])
+    prior = model.prior_mean
     assert np.all(np.abs(track.mean[1] - prior) > 1e-3)  # still predicted, towards its surroundings
     np.testing.assert_array_equal(track.mean[2:], [prior, prior])
     np.testing.assert_array_equal(track.std[3], [state.std for state in model.states])

@@ -7,14 +7,14 @@ import pytest
 from scipy.optimize import minimize
 
 from estimators.fold import Fold
-from estimators.log import READING, Events, Log
+from estimators.log import READING, Events
 from estimators.model.state_space import Noise, Parameter, Row, Sensor, State, StateSpaceModel
 from estimators.registry import ESTIMATORS
 from estimators.track import GATED, USED
 from estimators.tuning import Tuning
 from tests.estimators.linear_models import ROWS, random_linear
 from tests.models import level_model, unchanged
-from tests.support import SECOND, log_of
+from tests.support import SECOND, as_log, log_of
 
 NAMES = [name for name, entry in ESTIMATORS.items() if entry.family == "Gaussian" and name != "kf-steady"]
 P, R = 4.0, 0.25
@@ -224,8 +224,7 @@ def test_each_row_has_its_own_variance():
         noise = np.sqrt(matrices.R[sensor] * (np.array([1.0, 9.0, 1.0]) if sensor == 2 else 1.0))
         y = matrices.H[sensor] @ x + noise * rng.standard_normal(ROWS[sensor])
         batch.append(Events.one(t, t, READING, sensor, y, 3))
-    log = Log(3)
-    log.extend(Events.concat(batch, 3))
+    log = as_log(Events.concat(batch, 3))
     tuning = Tuning.of(matrices.model).with_options({"adapt": 1, "memory": 500, "bound": 30})
     fold = Fold("ekf", matrices.model, tuning, log)
     fold.advance()

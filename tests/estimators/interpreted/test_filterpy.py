@@ -125,7 +125,7 @@ def test_a_curved_model(name, values, log):
 
 def test_cubature_points_are_those_of_a_centre_without_weight(log):
     """Arasaratnam & Haykin (2009): x ± √n Lᵢ of equal weight, which FilterPy's UKF has with α = 1 and β = κ = 0."""
-    theirs = fold("filterpy-ukf", PENDULUM, Tuning.of(PENDULUM).with_options(dict(alpha=1, beta=0, kappa=0)), log)
+    theirs = folded("filterpy-ukf", PENDULUM, log, options=dict(alpha=1, beta=0, kappa=0)).track
     ours = folded("ckf", PENDULUM, log)
     close(theirs, ours.track)
     mean, cov = ours.moments()
@@ -144,11 +144,11 @@ def test_angles_turn_past_pi(name):
         if rng.random() < 0.2:
             y[int(rng.integers(2))] = np.nan
         events.extend(Events.one(k * SECOND // 10, 0, READING, 0, y, 2))
-    ours, theirs = (fold(n, COMPASS, Tuning.of(COMPASS), events, pairs=PAIRS[:1]) for n in (name, f"filterpy-{name}"))
+    ours, theirs = (folded(n, COMPASS, events, pairs=PAIRS[:1]).track for n in (name, f"filterpy-{name}"))
     close(theirs, ours)
     assert np.sum(np.abs(np.diff(theirs.mean[:, 0])) > np.pi) >= 1  # it did pass
     assert np.nanmax(np.abs(theirs.innovation[:, 0])) < 1.0
-    ensemble = fold("filterpy-enkf", COMPASS, Tuning.of(COMPASS).with_options({"members": 400}), events)
+    ensemble = folded("filterpy-enkf", COMPASS, events, options={"members": 400}).track
     off = (ensemble.mean[:, 0] - ours.mean[:, 0] + np.pi) % (2 * np.pi) - np.pi
     # Chance of 400 members, gathered over the few readings that the filter remembers: half a sigma is ten times that.
     assert np.max(np.abs(off) / ours.std[:, 0]) < 0.5
@@ -164,7 +164,7 @@ def test_enkf_is_within_monte_carlo_error_of_the_exact_answer():
     """After a prediction and a reading: a member's mean and variance scatter by σ/√N and σ²√(2/N)."""
     N = 10_000
     theirs = one_reading(N)
-    exact = fold("kf", MODEL, Tuning.of(MODEL), theirs.log)
+    exact = folded("kf", MODEL, theirs.log).track
     # The gain is the members' too and the perturbations add theirs: twice the scatter of plain draws, at 4 sigma.
     assert np.all(np.abs(theirs.track.mean - exact.mean) < 8 * exact.std / np.sqrt(N))
     assert np.all(np.abs(theirs.track.std**2 / exact.std**2 - 1) < 8 * np.sqrt(2 / N))

@@ -1,8 +1,5 @@
 """One function appends everything to a model, in one order, and names the part that it cannot append."""
 
-import subprocess
-import sys
-
 import numpy as np
 import pytest
 
@@ -11,7 +8,7 @@ from estimators.model.coloured import ColouredError
 from estimators.model.correction import Ridge
 from estimators.model.hybrid import LearnedCorrection
 from estimators.models import MODELS
-from tests import ROOT
+from tests.support import run_python
 
 MODEL = MODELS["motor_winding"]
 RIDGE = Ridge(np.array([[20.0], [30.0], [40.0]]), np.array([[0.1], [0.2], [0.1]]), 1.0)
@@ -77,9 +74,6 @@ print(sum(compile_model(joint(model, {"yoke_coolant": JointParameter(0.01)})).f.
 
 def test_code_of_a_wrapped_model_is_found_by_another_process():
     """Numba finds the code of a closure by what it encloses, also that of a wrapper around a wrapper."""
-    one, two = (
-        subprocess.run([sys.executable, "-c", ENCLOSED], cwd=ROOT, capture_output=True, text=True, check=True).stdout
-        for _ in range(2)
-    )
+    one, two = (run_python(ENCLOSED).stdout for _ in range(2))
     assert one.split()[:4] == two.split()[:4] and len(set(two.split()[:4])) == 4
     assert two.split()[4] == "0", two

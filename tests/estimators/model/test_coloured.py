@@ -18,6 +18,7 @@ from estimators.model.state_space import Noise, Parameter, Row, Sensor, State, S
 from estimators.models import MODELS
 from estimators.tuning import Tuning
 from tests.models import level_model
+from tests.support import error_of, folded
 from tests.support import log_of as log_of_rows
 
 TAU, Q, R, STD, ERROR, ERROR_TIME = 7.0, 0.3, 0.04, 2.0, 0.6, 20.0
@@ -85,7 +86,7 @@ def regression(level, readings):
 
 def agree(estimator, model, level, readings, times):
     y, mean, std, log_density = regression(level, readings)
-    track = fold(estimator, model, Tuning.of(model), log_of(times, y))
+    track = folded(estimator, model, log_of(times, y)).track
     # Sigma points cancel numbers of order 1e6 (alpha 1e-3), which costs half of the digits of what is left.
     tolerance = 1e-8 if "ukf" in estimator else 1e-9
     np.testing.assert_allclose(track.mean[:, 0], mean, rtol=0, atol=100 * tolerance)
@@ -128,7 +129,7 @@ def test_the_shorter_it_lasts_the_nearer_to_white_noise():
     worst = []
     for tau in (1e-4, 1e-6, 1e-8):
         model = coloured(WALK, {"level": tau})
-        track = fold("kf", model, Tuning.of(model), log_of(times, y))
+        track = folded("kf", model, log_of(times, y)).track
         worst.append(max(np.abs(track.mean[:, 0] - mean).max(), np.abs(track.std[:, 0] - std).max()))
     # Of the first order in τ: what the integral over a step lacks of q dt is 1.5 q τ; the shortest step is 1 ms.
     assert worst[0] < 0.1 and worst[1] < 0.011 * worst[0] and worst[2] < 0.011 * worst[1]
@@ -137,7 +138,7 @@ def test_the_shorter_it_lasts_the_nearer_to_white_noise():
 def discrete(model, dt):
     """F and Q of a model over a step, from what is compiled."""
     compiled = compile_model(model)
-    p = np.array([item.value for item in model.parameters])
+    p = model.default_parameters
     q = np.array([item.variance for item in model.noises])
     F, Q = np.empty((model.nx, model.nx)), np.zeros((model.nx, model.nx))
     for j in range(model.nx):
@@ -162,7 +163,7 @@ def test_a_step_is_that_of_the_exponential_of_a_matrix(a):
 def test_a_steady_gain_is_that_of_the_kalman_filter_in_the_end():
     y = 1.0 + np.cumsum(np.random.default_rng(2).normal(0.0, 0.7, 600))
     log = log_of(np.arange(600.0), y)
-    exact, steady = (fold(name, BOTH, Tuning.of(BOTH), log) for name in ("kf", "kf-steady"))
+    exact, steady = (folded(name, BOTH, log).track for name in ("kf", "kf-steady"))
     # The slowest mode of the error decays over some 20 s; after 300 s nothing of the start is left.
     np.testing.assert_allclose(steady.mean[300:], exact.mean[300:], rtol=0, atol=1e-6)
     np.testing.assert_allclose(steady.std[300:], exact.std[300:], rtol=0, atol=1e-9)
@@ -172,9 +173,9 @@ def test_a_steady_gain_is_that_of_the_kalman_filter_in_the_end():
 def test_particles_agree_with_the_kalman_filter_within_chance(estimator):
     rng = np.random.default_rng(4)
     log = log_of(np.arange(40.0), 1.0 + np.cumsum(rng.normal(0.0, 0.5, 40)))
-    exact = fold("kf", BOTH, Tuning.of(BOTH), log)
+    exact = folded("kf", BOTH, log).track
     n = 20_000
-    found = fold(estimator, BOTH, Tuning.of(BOTH).with_options({"particles": float(n)}), log)
+    found = folded(estimator, BOTH, log, options={"particles": float(n)}).track
     # Of n independent particles a mean has the error σ/√n; resampling leaves some twentieth of them independent.
     error = np.abs(found.mean - exact.mean) / exact.std
     assert error.max() < 5.0 * np.sqrt(20.0 / n)
@@ -185,7 +186,7 @@ def test_a_sensors_own_likelihood_is_that_of_what_the_error_leaves():
     own = replace(WALK, sensors=(replace(WALK.sensors[0], log_likelihood=density),))
     plain, mine = (coloured(m, {"level": TAU}, {"gauge": ColouredError((ERROR**2,), ERROR_TIME)}) for m in (WALK, own))
     log = log_of(np.arange(30.0), 1.0 + 0.3 * np.arange(30.0))
-    a, b = (fold("pf", model, Tuning.of(model).with_options({"particles": 500.0}), log) for model in (plain, mine))
+    a, b = (folded("pf", model, log, options={"particles": 500.0}).track for model in (plain, mine))
     np.testing.assert_allclose(a.mean, b.mean, rtol=1e-9)
 
 
@@ -262,7 +263,7 @@ def test_correlation_times_and_variances_are_turned_while_it_runs():
     declared = coloured(walk, {"level": 2.0}, {"gauge": ColouredError((0.5,), 3.0)})
     # The belief at the start is the model's, as ever; the rest is what it is turned to.
     declared = replace(declared, states=BOTH.states)
-    np.testing.assert_allclose(fold("kf", declared, Tuning.of(declared), log).mean, turned.mean, rtol=1e-12)
+    np.testing.assert_allclose(folded("kf", declared, log).track.mean, turned.mean, rtol=1e-12)
     assert [item.key for item in tuning.items()] == [
         "Q.level", "Q.gauge_error", "R.gauge", "p.level_disturbance_time", "p.gauge_error_time"
     ]  # fmt: skip
@@ -275,7 +276,7 @@ def test_two_wrapped_models_are_told_apart_when_both_are_wrapped_again():
     ends = []
     for f in (leaking, growing):
         model = joint(coloured(replace(base, f=f), {"level": TAU}), {"leak": JointParameter(0.01)})
-        ends.append(fold("ekf", model, Tuning.of(model), log).mean[-1, 0])
+        ends.append(folded("ekf", model, log).track.mean[-1, 0])
     assert abs(ends[0] - ends[1]) > 1e-3
 
 
@@ -295,7 +296,7 @@ def test_linear_parts_and_modes_stay_what_they_are():
     out = np.empty(model.nx)
     x = model.prior_mean.copy()
     x[-2] = 2.0
-    compiled.f(x, np.zeros(model.nu), np.array([item.value for item in model.parameters]), 1e-9, out)
+    compiled.f(x, np.zeros(model.nu), model.default_parameters, 1e-9, out)
     at = {name: k for k, name in enumerate(model.state_names)}
     assert (out[at["surface"]] - x[at["surface"]]) * (out[at["depth"]] - x[at["depth"]]) < 0.0
 
@@ -336,7 +337,5 @@ REFUSED = [
 
 @pytest.mark.parametrize(("model", "noises", "errors", "words"), REFUSED)
 def test_what_cannot_last_is_refused(model, noises, errors, words):
-    with pytest.raises(ModelError) as caught:
-        coloured(model, noises, errors)
-    assert words in str(caught.value) and "\n" not in str(caught.value)
+    assert words in error_of(ModelError, coloured, model, noises, errors)
     assert coloured(WALK) is WALK

@@ -18,6 +18,7 @@ from estimators.model.hybrid import LearnedCorrection, hybrid
 from estimators.model.state_space import Input, Noise, Parameter, Row, Sensor, State, StateSpaceModel
 from estimators.tuning import Tuning
 from tests.models import complex_step, second_state
+from tests.support import folded
 
 RNG = np.random.default_rng(3)
 POINTS = RNG.normal((60.0, 10.0, -2.0), (10.0, 3.0, 0.5), (24, 3))
@@ -70,7 +71,7 @@ def called(model, place, dt=0.5):
     """f, Q and their compiled forms at one place: next state, covariance."""
     compiled = compile_model(model)
     x, u = np.array(place[:2]), np.array(place[2:])
-    p = np.array([item.value for item in model.parameters])
+    p = model.default_parameters
     q = np.array([noise.variance for noise in model.noises])
     out, Q = np.empty(2), np.zeros((2, 2))
     compiled.f(x, u, p, dt, out)
@@ -199,8 +200,8 @@ def test_a_net_beside_the_physics_is_the_physics_that_has_it(name):
 @pytest.mark.parametrize("name", ["ekf", "ukf", "filterpy-ekf"])
 def test_filters_that_are_compiled_see_what_filterpy_sees(name):
     model = hybrid(PHYSICS, learned(CORRECTIONS["gp"]))
-    own, peer = (fold(each, model, Tuning.of(model), log_of(model)) for each in (name, "filterpy-ekf"))
-    plain = fold("ekf", PHYSICS, Tuning.of(PHYSICS), log_of(PHYSICS))
+    own, peer = (folded(each, model, log_of(model)).track for each in (name, "filterpy-ekf"))
+    plain = folded("ekf", PHYSICS, log_of(PHYSICS)).track
     # The UKF's mean of a curved f is another one; what the correction does is a hundred times as much.
     tolerance = 0.05 if name == "ukf" else 1e-9
     assert np.max(np.abs(own.mean - peer.mean)) < tolerance
@@ -214,7 +215,7 @@ def test_it_goes_with_noise_that_lasts_and_with_parameters_that_are_estimated():
     compiled = compile_model(model)
     place = PLACES[0]
     x, u = np.array([place[0], place[1], 0.2, 0.05]), np.array(place[2:])
-    p = np.array([item.value for item in model.parameters])
+    p = model.default_parameters
     out = np.empty(4)
     compiled.f(x, u, p, 0.5, out)
     expected, Q_corrected = called(corrected, place)
@@ -236,7 +237,7 @@ def test_a_black_box_is_corrected_too():
         black_box=True, linear=False,
     )  # fmt: skip
     tracks = [
-        fold("filterpy-ekf", model, Tuning.of(model), log_of(model))
+        folded("filterpy-ekf", model, log_of(model)).track
         for model in (hybrid(box, learned(CORRECTIONS["gp"])), hybrid(PHYSICS, learned(CORRECTIONS["gp"])))
     ]
     # Slopes of a black box are central differences.

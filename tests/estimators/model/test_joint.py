@@ -8,12 +8,10 @@ import pytest
 from estimators.compiled.model import compile_model
 from estimators.diagnostics.detectors import OUTSIDE
 from estimators.errors import ModelError
-from estimators.fold import fold
 from estimators.log import READING, Events, Log
 from estimators.model.assemble import JointParameter, joint
 from estimators.model.state_space import Noise, Parameter, Row, Sensor, State, StateSpaceModel
 from estimators.models import MODELS
-from estimators.tuning import Tuning
 from tests.models import level_model
 from tests.support import SECOND, folded
 
@@ -76,8 +74,8 @@ def test_an_unknown_inflow_is_estimated_as_by_a_kalman_filter_augmented_by_hand(
     assert model.state_names == ("level", "inflow")
     assert [item.name for item in model.parameters] == ["leak", "offset"]
     log = readings()
-    got = fold(estimator, model, Tuning.of(model), log)
-    exact = fold("kf", BY_HAND, Tuning.of(BY_HAND), log)
+    got = folded(estimator, model, log).track
+    exact = folded("kf", BY_HAND, log).track
     # The model is linear in x and inflow, and complex step exact; the UKF cancels numbers of order 1 at alpha's scale.
     np.testing.assert_allclose(got.mean, exact.mean, rtol=0, atol=1e-9)
     np.testing.assert_allclose(got.std, exact.std, rtol=0, atol=1e-9)
@@ -131,7 +129,7 @@ def test_the_motors_derivatives_reach_the_resistance() -> None:
     compiled = compile_model(moved)
     x = np.array([80.0, 75.0, 70.0, 60.0, 0.03])
     u = np.array([-50.0, 120.0, 300.0, 40.0, 25.0])
-    p = np.array([item.value for item in moved.parameters])
+    p = moved.default_parameters
     z, out = x.astype(complex), np.empty(5, complex)
     z[4] += 1e-20j
     compiled.f(z, u, p, 0.5, out)

@@ -57,7 +57,7 @@ def test_jacobians_match_central_differences_at_random_states(name):
     np.testing.assert_array_equal(compiled.static["H_mode"], given)
     rng = np.random.default_rng(1)
     std = np.array([state.std for state in model.states])
-    mean = np.array([state.mean for state in model.states])
+    mean = model.prior_mean
     p = defaults(model)
     dt = min(0.5, model.max_step)
 
@@ -68,7 +68,7 @@ def test_jacobians_match_central_differences_at_random_states(name):
     calls += [(of_h(k), len(sensor.rows)) for k, sensor in enumerate(model.sensors)]
     for _ in range(20):
         x = mean + std * rng.standard_normal(model.nx)
-        u = np.array([item.default for item in model.inputs]) + rng.normal(0.0, 20.0, model.nu)
+        u = model.default_inputs + rng.normal(0.0, 20.0, model.nu)
         for function, rows in calls:
             near = np.empty((rows, model.nx))
             for j in range(model.nx):

@@ -114,7 +114,7 @@ def circle(t, x):
 def test_a_step_is_right_to_fourth_order(model, tendency, dt):
     """One step is off by c dt⁵, so half the step leaves 1/32 of it, the reference is good to 1e-11."""
     rng = np.random.default_rng(0)
-    p = np.array([item.value for item in model.parameters])
+    p = model.default_parameters
     x = model.prior_mean + model.prior_std * rng.standard_normal(model.nx)
     off = []
     for step in (dt, dt / 2, dt / 4):

@@ -92,7 +92,7 @@ def test_heat_that_cells_pass_to_each_other_cancels() -> None:
 
 
 def test_open_circuit_is_scipys_monotone_cubic_with_its_slope() -> None:
-    p = np.array([item.value for item in BATTERY_CELL.parameters])
+    p = BATTERY_CELL.default_parameters
     volts = p[: len(NODES)]
     assert (np.diff(volts) > 0).all()
     inner = np.linspace(NODES[1], NODES[-2], 400)  # at both ends PCHIP takes slopes of another kind
@@ -113,7 +113,7 @@ def test_open_circuit_is_scipys_monotone_cubic_with_its_slope() -> None:
 def test_slopes_match_complex_step_from_below_empty_to_above_full(model, soc: float) -> None:
     rng = np.random.default_rng(7)
     compiled = compile_model(model)
-    p = spoiled() if model is BATTERY_PACK else np.array([item.value for item in model.parameters])
+    p = spoiled() if model is BATTERY_PACK else model.default_parameters
     n = model.nx
     x = np.tile([soc, 0.02, 30.0], n // 3) + rng.normal(0, 1, n) * np.tile([2e-3, 0.01, 5.0], n // 3)
     u = np.array([7.0, 20.0])

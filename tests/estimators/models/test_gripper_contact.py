@@ -12,7 +12,7 @@ from estimators.log import truth_of
 from estimators.models.gripper_contact import CONTACT, DEPTH, GRIPPER_CONTACT, SURFACE, chances
 from tests.support import folded
 
-P = np.array([item.value for item in GRIPPER_CONTACT.parameters])
+P = GRIPPER_CONTACT.default_parameters
 SEEDS = (1, 2, 3, 4)
 
 

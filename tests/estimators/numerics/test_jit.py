@@ -15,6 +15,7 @@ from estimators.model.wrapping import as_inner
 from estimators.numerics.cache_entries import EntryFiles
 from estimators.numerics.jit import by_address, embedded, inner, inner_embedded, jit, linkable, linkable_embedded, part
 from tests import ROOT
+from tests.support import run_python
 
 LOADED = """
 from llvmlite.binding import address_of_symbol
@@ -26,22 +27,14 @@ print(address_of_symbol("numba_parallel_for") is not None, address_of_symbol("al
 
 def test_code_from_the_cache_finds_the_threads_that_it_may_call():
     """What LLVM does not find when it loads such code ends the process, whatever filter came first."""
-    run = subprocess.run([sys.executable, "-c", LOADED], cwd=ROOT, capture_output=True, text=True, check=True)
-    assert run.stdout.split() == ["True", "True"]
+    assert run_python(LOADED).stdout.split() == ["True", "True"]
 
 
 def drawn(cache) -> subprocess.CompletedProcess[str]:
     """Call two compiled functions in another process, with a cache of its own."""
     code = "from estimators.numerics.random import key_of, word; print(key_of(1, 2, 3), word(2**63, 2**63))"
     environment = {key: value for key, value in os.environ.items() if key != "NUMBA_CACHE_DIR"}
-    return subprocess.run(
-        [sys.executable, "-c", code],
-        cwd=ROOT,
-        env=environment | {"XDG_CACHE_HOME": str(cache)},
-        capture_output=True,
-        text=True,
-        check=True,
-    )
+    return run_python(code, env=environment | {"XDG_CACHE_HOME": str(cache)})
 
 
 def test_a_damaged_entry_is_discarded_and_compiled_again(tmp_path):
@@ -141,8 +134,7 @@ def test_closures_that_two_processes_compiled_are_told_apart_by_a_third(tmp_path
     def run(*powers: int) -> list[float]:
         code = f"import numpy as np, closures; print(*[closures.made(k)(np.linspace(1, 2, 5)) for k in {powers}])"
         environment = os.environ | {"PYTHONPATH": f"{ROOT}:{tmp_path}", "NUMBA_CACHE_DIR": str(tmp_path / "cache")}
-        made = subprocess.run([sys.executable, "-c", code], env=environment, capture_output=True, text=True, check=True)
-        return [float(value) for value in made.stdout.split()]
+        return [float(value) for value in run_python(code, env=environment).stdout.split()]
 
     (one,), (two,) = run(2), run(4)
     assert one != two
@@ -166,8 +158,7 @@ def printed(folder: Path, code: str) -> list[str]:
     """What a process prints that has `LINKED` as a module `linked`, and the cache of the processes before it."""
     (folder / "linked.py").write_text(LINKED)
     environment = os.environ | {"PYTHONPATH": f"{ROOT}:{folder}", "NUMBA_CACHE_DIR": str(folder / "cache")}
-    command = [sys.executable, "-c", code]
-    return subprocess.run(command, env=environment, capture_output=True, text=True, check=True).stdout.split()
+    return run_python(code, env=environment).stdout.split()
 
 
 def test_code_from_the_cache_needs_no_tables_of_numba_and_is_linked_into_new_code(tmp_path):

@@ -153,7 +153,7 @@ def test_queries_between_readings_and_steps_within(estimator):
     events = [reading(t, y) for t, y in zip(TIMES, PLACES, strict=True)] + [query(t) for t in asked]
     log = body_log(events)
     chain, clock = Chain(*START), 0.0
-    for t, kind, value in zip(log.t[: log.n] / SECOND, log.kind[: log.n], log.value[: log.n, 0], strict=True):
+    for t, kind, value in zip(log.events.t / SECOND, log.events.kind, log.events.value[:, 0], strict=True):
         chain.go_on(*moved(t - clock))
         clock = t
         if kind == READING:
@@ -184,7 +184,7 @@ def test_a_reset_and_a_maintenance(estimator):
             # The filter keeps the mean of what it no longer knows.
             chains[-1].go_on(np.diag([1.0, 0.0]), np.diag([0.0, START[1][1, 1]]), (0.0, fold.track.mean[i, 1]))
     # Of the two states at the maintenance the row shows the later; the first is the prior.
-    at = int(np.flatnonzero(log.t[: log.n] == changed * SECOND)[-1]) + 1
+    at = int(np.flatnonzero(log.events.t == changed * SECOND)[-1]) + 1
     pairs = zip(*(chain.solved() for chain in chains), strict=True)
     expected = [np.concatenate((np.delete(first, at, 0)[1:], second)) for first, second in pairs]
     agree(moments(smooth_with_pairs(estimator, log), 2), expected)
@@ -199,7 +199,7 @@ def long_log(n=3000, seed=3, jump=0.0):
     rng = np.random.default_rng(seed)
     t = np.cumsum(rng.integers(1, 40, n)) * (SECOND // 100)
     y = np.cumsum(rng.normal(0, 0.3, n)) + np.where(np.arange(n) < n // 2, 0.0, jump)
-    readings = Events(t, t, np.full(n, READING, np.int8), np.zeros(n, np.int32), y.reshape(n, 1))
+    readings = Events.alike(READING, t, y)
     asked = readings.select(np.arange(0, n, 3))
     between = asked._replace(t=asked.t + SECOND // 300, kind=np.full(asked.t.size, TICK, np.int8))
     at = asked._replace(kind=np.full(asked.t.size, TICK, np.int8))

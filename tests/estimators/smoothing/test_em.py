@@ -4,14 +4,13 @@ import numpy as np
 import pytest
 from scipy.optimize import minimize
 
-from estimators import Log
 from estimators.errors import EstimatorError
 from estimators.fold import fold
 from estimators.log import READING, Events
 from estimators.smoothing.em import em
 from estimators.tuning import Tuning
 from tests.estimators.smoothing.test_dense import BODY, moved
-from tests.support import SECOND
+from tests.support import SECOND, as_log
 
 
 def drive(n=400, seed=5):
@@ -23,10 +22,7 @@ def drive(n=400, seed=5):
         F, Q = moved(dt)
         x, t = F @ x + rng.multivariate_normal(np.zeros(2), Q), t + dt
         rows.append((round(t * SECOND), x[0] + rng.normal(0, 0.5)))
-    log = Log.of(BODY)
-    times = np.array([row[0] for row in rows])
-    log.extend(Events(times, times, np.full(n, READING, np.int8), np.zeros(n, np.int32), np.array(rows)[:, 1:]))
-    return log
+    return as_log(Events.alike(READING, np.array([t for t, _ in rows]), np.array([y for _, y in rows])))
 
 
 def test_it_agrees_with_the_maximum():

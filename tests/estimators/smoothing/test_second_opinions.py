@@ -3,9 +3,10 @@
 import numpy as np
 from filterpy.kalman import JulierSigmaPoints, UnscentedKalmanFilter
 
-from estimators import Log, fold
+from estimators import fold
 from estimators.model.state_space import Noise, Row, Sensor, State, StateSpaceModel
 from tests.estimators.smoothing.test_dense import Q
+from tests.support import measured
 
 
 def swing(x, u, p, dt, out):
@@ -57,8 +58,7 @@ def test_filterpy_by_sigma_points():
         means.append(its.x.copy())
         covs.append(its.P.copy())
     expected, cov, _ = its.rts_smoother(np.array(means), np.array(covs))
-    log = Log.of(PENDULUM)
-    log.add("height", dt * np.arange(n), np.array(ys))
+    log = measured(PENDULUM, "height", dt * np.arange(n), np.array(ys))
     for estimator in ("ukf", "sr-ukf"):
         ours = fold(estimator, PENDULUM, log, covariance=True, smoothed=True, alpha=1.0, beta=0.0, kappa=1.0)
         np.testing.assert_allclose(ours.mean, expected, rtol=0, atol=1e-9)

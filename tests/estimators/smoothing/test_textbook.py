@@ -18,6 +18,7 @@ from estimators.smoothing.smooth import consistency
 from estimators.smoothing.walk import Smoothed
 from tests.estimators.smoothing.test_second_opinions import PENDULUM
 from tests.models import first_states
+from tests.support import measured
 
 
 def f(x, u, p, dt, out):
@@ -65,8 +66,7 @@ def car(seed, n=100, dt=0.1):
         xs.append(x)
     xs = np.array(xs)
     ys = xs[:, :2] + 0.5 * rng.normal(size=(n, 2))
-    log = Log.of(CAR, start=0.0)
-    log.add("place", dt * np.arange(1, n + 1), ys)
+    log = measured(CAR, "place", dt * np.arange(1, n + 1), ys, start=0.0)
     return xs, ys, log
 
 

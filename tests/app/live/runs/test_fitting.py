@@ -11,9 +11,9 @@ from estimators.errors import ConfigError
 from estimators.fit.fit import fit
 from estimators.fit.recording import Recording
 from estimators.fold import Fold
-from estimators.log import Log
 from estimators.tuning import Tuning
 from tests.app.scripted import MODEL, Stepped, random_walk, readings
+from tests.support import as_log
 
 FIRST = Tuning.of(MODEL)
 WANTED = ["Q.rate", "R.winding"]
@@ -33,8 +33,7 @@ def fitted(engine, *request):
 
 
 def alone(n):
-    log = Log(MODEL.width)
-    log.extend(walk(n))
+    log = as_log(walk(n))
     return fit("kf", FIRST, [Recording(log)], wanted=WANTED)
 
 

@@ -7,18 +7,17 @@ from app.live import commands
 from app.live.history_copy import COPY_ROWS
 from app.live.runs.scores import RunScores
 from estimators.fold import fold
-from estimators.log import Log
 from estimators.track import HELD_OUT, USED
 from estimators.tuning import Tuning
 from tests.app.scripted import MODEL, Stepped, random_walk, readings
+from tests.support import as_log
 from tests.waiting import wait_for
 
 FIRST = Tuning.of(MODEL)
 
 
 def by_hand(estimator, tuning, n):
-    log = Log(MODEL.width)
-    log.extend(readings(*random_walk(n)))
+    log = as_log(readings(*random_walk(n)))
     return fold(estimator, MODEL, tuning, log), log.events
 
 

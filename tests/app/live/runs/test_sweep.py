@@ -17,12 +17,12 @@ from app.live.runs.sweep import (
     values_around,
 )
 from estimators.errors import ConfigError
-from estimators.fold import Fold, fold
-from estimators.log import Log
+from estimators.fold import fold
 from estimators.models import MODELS
 from estimators.track import USED
 from estimators.tuning import Tuning
 from tests.app.scripted import MODEL, Stepped, random_walk, readings, twin
+from tests.support import as_log, folded
 
 FIRST = Tuning.of(MODEL)
 
@@ -37,8 +37,7 @@ def started(n):
 
 def brute_force(key, n):
     """Log-likelihood and mean NIS of a whole fold for each factor, from the prior."""
-    log = Log(MODEL.width)
-    log.extend(walk(n))
+    log = as_log(walk(n))
     found = {}
     for factor in FACTORS:
         track = fold("kf", MODEL, FIRST.set(key, FIRST.get(key) * factor), log)
@@ -70,10 +69,8 @@ def test_a_window_goes_on_from_a_snapshot_as_the_whole_fold_did():
     again = taken.fold()
     again.advance()
     np.testing.assert_array_equal(again.track.mean, taken.track.mean)
-    log = Log(MODEL.width)
-    log.extend(walk(6000))
-    whole = Fold("kf", MODEL, FIRST, log)
-    whole.advance()
+    log = as_log(walk(6000))
+    whole = folded("kf", MODEL, log, FIRST)
     np.testing.assert_array_equal(again.track.mean, whole.track.mean[taken.first :])
 
 

@@ -17,7 +17,7 @@ from app.twin.log_reader import read_log
 from app.twin.twin import load_twin
 from app.web.gallery.cards import picture_file
 from config.loader import find, shipped
-from estimators.fold import Fold
+from tests.support import folded
 
 SVG = "{http://www.w3.org/2000/svg}"
 
@@ -33,15 +33,14 @@ def drawn(name, **overrides):
     """The picture of a twin, its log, and the fold that it shows."""
     twin = load_twin(name, overrides=overrides)
     log, _ = read_log(twin, None)
-    fold = Fold(twin.estimator, twin.model, twin.tuning, log, pairs=twin.pairs)
-    fold.advance()
+    fold = folded(twin.estimator, twin.model, log, twin.tuning, pairs=twin.pairs)
     return card.picture_of(twin, log), log, fold
 
 
 def test_a_card_shows_the_estimate_of_the_state_that_no_sensor_measures():
     picture, log, fold = drawn("motor_winding")
     (line,), (truth,) = (paths(picture, color) for color in ("estimate", "truth"))
-    rate, seconds = fold.track.mean[:, 1], (log.t[: log.n] - log.t[0]) * 1e-9
+    rate, seconds = fold.track.mean[:, 1], (log.events.t - log.t[0]) * 1e-9
     assert line[0, 0] == pytest.approx(card.MARGIN, abs=0.1)
     assert line[-1, 0] == pytest.approx(card.WIDTH - card.MARGIN, abs=0.1)
     # Pixels are a linear function of seconds and rates.

@@ -136,7 +136,7 @@ def test_of_few_readings_nothing_is_said_of_the_innovations(tmp_path, number):
     """Two of which the second is far off bear no band out, and tell none wrong either."""
     twin = load_twin(write(tmp_path, "few", "LINEAR", "kf", recordings.linear, "rail"))
     log = read_log(twin, 0.5 if number == 1 else 1.5)[0]
-    assert int((log.kind[: log.n] == READING).sum()) == number
+    assert int((log.events.kind == READING).sum()) == number
     found = advise(Measured(twin, log)).claim("consistent")
     assert found.answer == UNTOLD and found.remedy == ""
 
@@ -148,7 +148,7 @@ def test_faults_of_a_sensor_are_left_out(tmp_path, nisus):
     clean, excluded = without_faults(twin, log)
     begin, end = recordings.STUCK.start, recordings.STUCK.stop
     assert excluded == (Exclusion("rail", "stuck", begin, end - 1, end - begin),)
-    assert np.flatnonzero(np.isnan(clean.value[: clean.n, 0])).tolist() == list(range(begin, end))
+    assert np.flatnonzero(np.isnan(clean.events.value[:, 0])).tolist() == list(range(begin, end))
     page = nisus("advise", path).words
     assert "Excluded: faults of sensors rail, 200 s to 259 s: stuck (60 readings)" in page
     assert "Bands are right within a quarter, and innovations are hardly correlated" in page
@@ -163,6 +163,6 @@ def test_what_lasts_for_most_of_the_log_is_no_fault(tmp_path):
 
     clean, excluded = without_faults(twin, log, [shifted(100.0, 109.0), shifted(400.0, None)])
     assert [item.readings for item in excluded] == [10, recordings.N - 400]
-    assert np.isnan(clean.value[: clean.n, 0]).sum() == 10 + recordings.N - 400
+    assert np.isnan(clean.events.value[:, 0]).sum() == 10 + recordings.N - 400
     whole, excluded = without_faults(twin, log, [shifted(100.0, None)])
     assert excluded == () and whole is log

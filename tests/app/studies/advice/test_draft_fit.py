@@ -13,7 +13,6 @@ from app.studies.advice.signals import signal
 from app.twin.log_reader import read_log
 from app.twin.twin import load_twin
 from estimators.fit.objective import FitProgress
-from estimators.fold import Fold
 from estimators.log import READING
 from sources.inspect import SignalSeries, inspect_recordings
 
@@ -29,12 +28,12 @@ def write(path, **columns):
 
 def second_half(twin, log):
     """Return the innovations in σ of each sensor from the median time of measurements on, by a fold of the YAML."""
-    fold = Fold(twin.estimator, twin.model, twin.tuning, log)
+    fold = twin.fold(log)
     fold.advance()
-    rows = log.kind[: log.n] == READING
-    late = log.t[: log.n] >= np.median(log.t[: log.n][rows])
+    rows = log.events.kind == READING
+    late = log.events.t >= np.median(log.events.t[rows])
     e = fold.track.innovation[:, 0] / fold.track.innovation_std[:, 0]
-    return {name: e[rows & late & (log.channel[: log.n] == k)] for k, name in enumerate(twin.model.sensor_names)}
+    return {name: e[rows & late & (log.events.channel == k)] for k, name in enumerate(twin.model.sensor_names)}
 
 
 def test_three_wheels_are_sensors_of_one_speed_and_the_check_is_a_fold_of_the_yaml(tmp_path, nisus):

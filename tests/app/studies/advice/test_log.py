@@ -174,8 +174,8 @@ def drafted(path, *files, **roles):
 
 
 def of_sensor(log, twin, name):
-    rows = (log.kind[: log.n] == READING) & (log.channel[: log.n] == twin.model.sensor_names.index(name))
-    return log.t[: log.n][rows], log.value[: log.n][rows, 0]
+    rows = (log.events.kind == READING) & (log.events.channel == twin.model.sensor_names.index(name))
+    return log.events.t[rows], log.events.value[rows, 0]
 
 
 def csv(path, **columns):

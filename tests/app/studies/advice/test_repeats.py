@@ -7,9 +7,9 @@ import pytest
 
 from app.studies.advice.measured import repeat_lines, repeats_of
 from config.yaml_files import parse
-from estimators.log import Log
 from estimators.models.motor_drive import MOTOR_WINDING
 from tests.sources.can.can_tools import dbc
+from tests.support import measured
 
 Q, STD = 0.02, 0.5
 
@@ -89,8 +89,7 @@ def test_interpolated_rows_are_refused_or_left_out(tmp_path, nisus):
 
 def test_the_measurements_of_a_twin_are_looked_at():
     model = MOTOR_WINDING
-    log = Log.of(model)
-    log.add("winding", np.arange(600.0), np.repeat(truth_and_values(1, 60, 1)[1], 10))
+    log = measured(model, "winding", np.arange(600.0), np.repeat(truth_and_values(1, 60, 1)[1], 10))
     assert repeat_lines(repeats_of(model, log)) == [
         "winding: new value every 10 s, repeated in 90 % of rows; give its channel in `source` the key repeats: "
         "every 10 s, and tune again"

@@ -98,7 +98,7 @@ def test_a_row_of_a_commissioned_twin_is_measured_by_what_was_normal():
     track, t = Track.allocate(z.size, 2, 0, 1), np.arange(z.size, dtype=np.int64) * 10**9
     track.verdict[:], track.dof[:] = USED, 1
     track.innovation[:, 0], track.innovation_std[:, 0] = 0.5 + 0.4 * z, 1.0
-    events = Events(t, t, np.full(z.size, READING, np.int8), np.zeros(z.size, np.int32), np.zeros((z.size, 1)))
+    events = Events.alike(READING, t, np.zeros((z.size, 1)))
 
     def said(*normal):
         tuning = Tuning.of(MODEL).set("gate", None)

@@ -19,7 +19,7 @@ from estimators.models import MODELS
 from tests.app.scripted import MODEL, Scripted, pull_all, readings, twin
 from tests.app.served import SECRET, Client
 from tests.cases import cases
-from tests.support import SECOND
+from tests.support import SECOND, error_of
 
 
 def running(n=200):
@@ -91,7 +91,7 @@ def test_inputs_hold_from_the_time_that_is_asked_for():
     times = np.arange(1, 40) * SECOND
     y = np.full((39, MODELS["motor_drive"].width), np.nan)
     y[:, 0] = 45.0
-    engine._accept([Events(times, times, np.full(39, READING, np.int8), np.zeros(39, np.int32), y)])
+    engine._accept([Events.alike(READING, times, y)])
     as_now, later, at_once = (
         ask(engine, horizon=60.0, inputs=inputs) for inputs in ({}, {"i_q": [[30.0, 400.0]]}, {"i_q": 400.0})
     )
@@ -146,9 +146,7 @@ def test_nothing_of_the_running_twin_changes():
 
 @cases(__file__, "refused_forecasts.csv")
 def test_what_cannot_be_asked_is_refused_in_one_line(body, reason):
-    with pytest.raises(ConfigError) as refused:
-        question_from_json(json.loads(body), MODELS["motor_drive"])
-    assert reason in str(refused.value) and "\n" not in str(refused.value)
+    assert reason in error_of(ConfigError, question_from_json, json.loads(body), MODELS["motor_drive"])
 
 
 def test_a_forecast_needs_measurements_and_has_a_longest_horizon():

@@ -12,6 +12,7 @@ from app.twin.log_reader import read_log
 from app.twin.twin import load_twin
 from estimators.errors import ConfigError
 from tests.skips import program, with_recording
+from tests.support import error_of
 
 WARNINGS = ("-std=c99", "-Wall", "-Wextra", "-Werror", "-pedantic", "-O2")
 
@@ -154,9 +155,8 @@ def test_single_precision_stays_within_the_bound_on_its_rounding_errors(compiler
 )  # fmt: skip
 def test_what_cannot_be_written_says_why(name, overrides, message):
     twin = load_twin(name, overrides=overrides)
-    with pytest.raises(ConfigError) as error:
-        export_c(twin.name, twin.estimator, twin.model, twin.tuning, None, 1)
-    assert str(error.value).startswith(f"{name}: {message}")
+    text = error_of(ConfigError, export_c, twin.name, twin.estimator, twin.model, twin.tuning, None, 1)
+    assert text.startswith(f"{name}: {message}")
 
 
 def test_command(compiler, tmp_path, capsys):

@@ -8,6 +8,7 @@ import pytest
 from app.studies.c_code.terms import FUNCTIONS, Reader, Statements, Term
 from estimators.errors import ModelError
 from estimators.numerics.jit import jit
+from tests.support import error_of
 
 NODES = np.array([0.0, 1.0, 2.5, 4.0])
 VALUES = np.array([0.3, -1.0, 0.5, 2.0])
@@ -141,9 +142,7 @@ def index(x, u, p, out):
 )
 def test_a_function_that_cannot_be_read_says_why(function, message):
     reader = Reader()
-    with pytest.raises(ModelError) as error:
-        reader.read(function, symbols(reader), (2,))
-    assert str(error.value) == message
+    assert error_of(ModelError, reader.read, function, symbols(reader), (2,)) == message
 
 
 def test_a_term_is_no_number():

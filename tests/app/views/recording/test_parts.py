@@ -26,15 +26,13 @@ from app.views.recording.rrd_file import NEVER, Split, parse_split
 from app.views.recording.writer import Recorder, RecordingPart
 from app.web.server import command_from_json
 from estimators.errors import ConfigError
-from estimators.fold import Fold
 from estimators.log import Log
 from estimators.model.assemble import JointParameter, joint
 from estimators.model.instruments import Instrument, with_instruments
-from estimators.tuning import Tuning
 from sources.merged import MemorySource
 from tests import ROOT
-from tests.app.scripted import MODEL, Scripted, Stepped, pull_all, readings, twin
-from tests.support import assert_same
+from tests.app.scripted import MODEL, Scripted, Stepped, notice_texts, pull_all, readings, twin
+from tests.support import as_log, assert_same, folded, run_python
 from tests.waiting import LIMIT_S, wait_for
 
 COUNT = 6000
@@ -104,8 +102,7 @@ def refold(recorded):
     log = Log(MODEL.width)
     log.first = recorded.first
     log.extend(recorded.events)
-    fold = Fold(estimator, MODEL, tuning, log, pairs=np.array([[0, 1]]), base=recorded.base)
-    fold.advance()
+    fold = folded(estimator, MODEL, log, tuning, pairs=np.array([[0, 1]]), base=recorded.base)
     return fold.track
 
 
@@ -128,10 +125,8 @@ def test_a_factor_of_an_older_format_is_replaced_by_its_moments(tmp_path, estima
     """The upper factor of the whole covariance, as format 2 has it, in the place of the bordered one."""
     own = with_instruments(MODEL, {"winding": Instrument(offset=(0.0,))})
     model = joint(own, {"winding_offset": JointParameter(0.5, considered=True)})
-    log = Log(model.width)
-    log.extend(readings(TIMES[:400], VALUES[:400]))
-    whole = Fold(estimator, model, Tuning.of(model), log)
-    whole.advance()
+    log = as_log(readings(TIMES[:400], VALUES[:400]))
+    whole = folded(estimator, model, log)
     at, base = whole.base_at(200)
     mean, cov = base.mean, base.cov
     old = np.concatenate([mean, np.linalg.cholesky(cov).T.ravel()])
@@ -145,8 +140,7 @@ def test_a_factor_of_an_older_format_is_replaced_by_its_moments(tmp_path, estima
         assert ("old.rrd: format 2" in remark and estimator in remark) if number == 2 else not remark
         rest = log.copy()
         rest.drop_front(at)
-        fold = Fold(estimator, model, Tuning.of(model), rest, base=resumed)
-        fold.advance()
+        fold = folded(estimator, model, rest, base=resumed)
         # As the filters equal the equations: to 1e-9 of the largest.
         np.testing.assert_allclose(fold.track.mean, whole.track.mean[at:], rtol=0, atol=1e-9 * np.max(VALUES))
         np.testing.assert_allclose(fold.track.std, whole.track.std[at:], rtol=1e-9)
@@ -326,7 +320,7 @@ def test_a_taken_path_is_refused_by_command_line_and_running_twin(start, tmp_pat
     taken, target = tmp_path / "run.rrd", tmp_path / "elsewhere.rrd"
     taken.symlink_to(target) if broken_link else taken.write_bytes(b"yesterday")
     engine.submit(commands.Record(taken))
-    wait_for(lambda: any("is there already" in line.text for line in engine.notices.since(0)))
+    wait_for(lambda: any("is there already" in text for text in notice_texts(engine)))
     assert engine.recorder.path is None
     monkeypatch.chdir(tmp_path)
     with pytest.raises(ConfigError, match="already"):
@@ -353,7 +347,7 @@ def test_a_disk_that_fills_is_warned_of_and_the_recording_closed_in_time(start, 
     feed(source, engine, 0, 1000)
     assert warnings() == []
     free = app.views.recording.rrd_file.RESERVED_BYTES + 500_000_000
-    wait_for(lambda: any("has room for 500 MB more" in line.text for line in engine.notices.since(0)))
+    wait_for(lambda: any("has room for 500 MB more" in text for text in notice_texts(engine)))
     assert engine.recorder.path == path
     feed(source, engine, 1000, 1400)
     free = app.views.recording.rrd_file.RESERVED_BYTES - 1
@@ -417,7 +411,7 @@ def test_parts_of_a_dated_name_have_their_date_and_the_oldest_are_removed(start,
     source, engine, _ = start(split=parse_split("day", "150kB"))
     engine.submit(commands.Record(tmp_path / "%m" / "run-%Y%m%d.rrd"))
     source.put(readings(TIMES[:100], VALUES[:100]))
-    wait_for(lambda: any("removed" in line.text for line in engine.notices.since(0)) and recorded_to(engine) >= 100)
+    wait_for(lambda: any("removed" in text for text in notice_texts(engine)) and recorded_to(engine) >= 100)
     clock.now = time.struct_time((2026, 11, 24, 0, 0, 0, 1, 328, 0))
     source.put(readings(TIMES[100:200], VALUES[100:200]))
     wait_for(lambda: len(engine.recorder.written) == 2)
@@ -467,7 +461,7 @@ file.close()
 def test_memory_does_not_grow_with_what_was_written(tmp_path):
     """6000 writes are those of forty minutes; Rerun's own sink keeps 2 kB of each for the footer."""
     code = GROWTH.format(root=str(ROOT), path=str(tmp_path / "x.rrd"))
-    child = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    child = run_python(code)
     assert int(child.stdout) < 2_000_000
 
 

@@ -26,9 +26,9 @@ from estimators.log import TRUTH, Events, Log
 from estimators.track import Track
 from estimators.tuning import Tuning
 from tests import ROOT
-from tests.app.scripted import MODEL, Scripted, pull_all, readings, twin
+from tests.app.scripted import MODEL, Scripted, notice_texts, pull_all, readings, twin
 from tests.app.views.recording.test_parts import refold
-from tests.support import SECOND, assert_same
+from tests.support import SECOND, as_log, assert_same, error_of, run_python
 from tests.waiting import LIMIT_S, wait_for
 
 
@@ -50,8 +50,7 @@ def running():
 
 def steady(count, every=0.005):
     """Log and track of `count` equal readings, as the child process below sends them."""
-    log = Log(MODEL.width)
-    log.extend(readings(np.arange(1, count + 1) * every, np.full(count, 40.0)))
+    log = as_log(readings(np.arange(1, count + 1) * every, np.full(count, 40.0)))
     return log, fold("kf", MODEL, Tuning.of(MODEL), log, pairs=np.array([[0, 1]]))
 
 
@@ -85,7 +84,7 @@ def test_recording_holds_history_late_readings_and_retunes(running, tmp_path):
     np.testing.assert_array_equal(recorded.events.t, np.round(times * SECOND).astype(np.int64))
     np.testing.assert_array_equal(recorded.events.value[:, 0], values)
     assert_same(refold(recorded), seen.track)
-    texts = [line.text for line in engine.notices.since(0)]
+    texts = notice_texts(engine)
     assert [text for _, _, text in recorded.notices] == texts[: len(recorded.notices)]
     assert any("recording into" in text for _, _, text in recorded.notices)
     tuning, estimator = tuning_from_json(recorded.tuning, MODEL)
@@ -153,9 +152,7 @@ def test_place_that_cannot_be_written_is_one_line_and_the_twin_goes_on(running, 
 def test_what_is_no_recording_is_one_line(tmp_path, content):
     path = tmp_path / "x.rrd"
     path.write_bytes(content)
-    with pytest.raises(SourceError) as caught:
-        read_recording(path)
-    assert str(path) in str(caught.value) and "\n" not in str(caught.value)
+    assert str(path) in error_of(SourceError, read_recording, path)
 
 
 def test_absent_recording_is_one_line(tmp_path):
@@ -254,10 +251,7 @@ def test_a_recording_cut_before_its_first_row_is_told_from_another_programs(tmp_
 
     def message(content):
         cut.write_bytes(content)
-        with pytest.raises(SourceError) as caught:
-            read_recording(cut)
-        assert "\n" not in str(caught.value)
-        return str(caught.value).removeprefix(f"{cut}: ")
+        return error_of(SourceError, read_recording, cut).removeprefix(f"{cut}: ")
 
     named = ours.index(b"nisus_scripted") + 60
     for length in [*np.linspace(named, len(ours) - 40, 9).astype(int).tolist(), len(ours) - 40]:
@@ -275,12 +269,7 @@ def test_recordings_with_one_true_value_an_event_read_back(tmp_path):
     t = np.arange(1, 51) * 0.1
     x = np.stack((40 + t, rng.normal(0, 0.1, 50)), axis=1)
     spoken = readings(t, x[:, 0] + rng.normal(0, 2, 50))
-
-    def truths(channel, values):
-        channels = np.full(50, channel, np.int32)
-        return Events(spoken.t, spoken.t, np.full(50, TRUTH, np.int8), channels, values)
-
-    old = Events.concat([spoken, truths(0, x[:, :1]), truths(1, x[:, 1:])], 1)
+    old = Events.concat([spoken, *(Events.alike(TRUTH, spoken.t, x[:, k], k) for k in (0, 1))], 1)
     old = old.select(np.argsort(old.t, kind="stable"))
     path = tmp_path / "old.rrd"
     file = RecordingFile(path, twin(), None)
@@ -292,7 +281,7 @@ def test_recordings_with_one_true_value_an_event_read_back(tmp_path):
     log, blocks = Log(MODEL.width), Log(MODEL.width)
     log.extend(recorded.events)
     blocks.extend(spoken)
-    blocks.extend(truths(0, x))
+    blocks.extend(Events.alike(TRUTH, spoken.t, x))
     scores = [
         score(fold("kf", MODEL, Tuning.of(MODEL), events), events.events, MODEL).states for events in (log, blocks)
     ]
@@ -336,7 +325,7 @@ def test_a_file_that_takes_no_more_is_one_line_and_keeps_what_it_has(tmp_path):
     code = limited.replace("while True", "while not engine.notices.counts().get('recording failed')")
     code += "print('LINE', [line.text for line in engine.notices.since(0) if line.level == 'error'])\n"
     code = code.format(root=str(ROOT), path=str(path))
-    child = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, timeout=LIMIT_S)
+    child = run_python(code, timeout=LIMIT_S)
     (said,) = [line for line in child.stdout.splitlines() if line.startswith("LINE")]
     assert f"recording failed: {path}: it can no longer be written" in said and said.count("recording failed") == 1
     recorded = read_recording(path)

@@ -12,7 +12,6 @@ from rerun.chunk import RrdReader
 
 from app.format_time import FIRST_DATED_NS
 from app.live import commands
-from app.live.engine import Engine
 from app.views.recording.reader import read_recording
 from app.views.recording.writer import Recorder
 from app.views.rerun import feed
@@ -25,39 +24,30 @@ from estimators.diagnostics.detectors import ADVISORY_ALARM
 from estimators.diagnostics.references import HALF_WIDTH
 from estimators.log import READING, TRUTH, Events
 from estimators.track import HEALTH_NAMES
-from tests.app.scripted import MODEL, Replayed, pull_all, readings, twin
+from tests.app.scripted import MODEL, Replayed, Stepped, pull_all, readings, twin
 from tests.support import SECOND
 from tests.waiting import wait_for
 
 WINDOW = 10.0
 
 
-class Fed:
+class Fed(Stepped):
     """An engine on readings that the test gives, and a feed of it."""
 
     def __init__(self, tmp_path, **options):
-        self.source = Replayed()
         made = twin(**options)
         made.config.view = SimpleNamespace(window=WINDOW)
-        self.engine = Engine(made, lambda report: self.source)
+        super().__init__(source=Replayed(), of=made)
         self.feed = RerunFeed(self.engine)
         self.file = tmp_path / "piece.rrd"
         self.said = []
         self.pieces = []
-
-    def put(self, batch):
-        self.source.put(batch)
-        self.engine.settle()
 
     def events(self):
         return len(self.track().events)
 
     def track(self):
         return pull_all(self.engine)
-
-    def submit(self, command):
-        self.engine.submit(command)
-        self.engine.settle()
 
     def next(self):
         messages = self.feed.next()

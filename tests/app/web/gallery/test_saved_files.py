@@ -12,11 +12,10 @@ from app.twin.twin import load_twin
 from app.views.recording.reader import read_recording
 from app.web.gallery.gallery import SavedFiles
 from app.web.running import stamp_of
-from estimators.fold import Fold
-from estimators.log import Log
 from estimators.model.user_file import imported_beside
 from tests.app.scripted import pull_all
 from tests.app.web.gallery.opened import opened
+from tests.support import as_log
 from tests.waiting import wait_for
 
 YAML = """\
@@ -63,9 +62,8 @@ def lines(session):
 def mean(path, events):
     """What another fold makes of the same readings, with the file as it is."""
     twin = load_twin(path)
-    log = Log.of(twin.model)
-    log.extend(events)
-    fold = Fold(twin.estimator, twin.model, twin.tuning, log, pairs=twin.pairs)
+    log = as_log(events)
+    fold = twin.fold(log, pairs=twin.pairs)
     fold.advance()
     return fold.track.mean
 

@@ -6,10 +6,10 @@ import pytest
 from app.live.commands import Pin, SetTuning, UseSensor
 from estimators.attribution import attribution
 from estimators.fold import Fold
-from estimators.log import READING, Log
+from estimators.log import READING
 from tests.app.scripted import pull_all
 from tests.app.web.page.browsed import running, settled, until
-from tests.support import SECOND
+from tests.support import SECOND, as_log
 from tests.waiting import wait_for
 
 pytestmark = pytest.mark.browser
@@ -201,8 +201,7 @@ def test_what_moved_the_estimate_in_the_charts_is_explained(page, session):
     engine, model = session.engine, session.engine.model
     rows = pull_all(engine)
     origin = int(rows.events.t[0])
-    log = Log.of(model)
-    log.extend(rows.events)
+    log = as_log(rows.events)
     fold = Fold(engine.estimator, model, engine.tuning, log, policy=engine.policy, expected=engine.twin.expected)
     found = attribution(fold, origin + 50 * SECOND, origin + 60 * SECOND)
     answer = page.evaluate("fetch('/api/why?since=50&until=60').then((answer) => answer.json())")
