@@ -3,8 +3,6 @@
 import json
 import signal
 import sqlite3
-import subprocess
-import sys
 import zlib
 from contextlib import closing
 from types import SimpleNamespace
@@ -25,9 +23,10 @@ from app.twin.secrets import NO_SECRETS
 from config.output_schema import WebhookSection
 from estimators.errors import SourceError
 from sources.source import ignore
-from tests import ROOT
 from tests.app.outputs import test_fleet_alerts as of_fleets
-from tests.app.outputs.test_alerts import Looked, episode, kept_in, send, started, state
+from tests.app.outputs.pushed import push
+from tests.app.outputs.test_alerts import Looked, episode, kept_in, started, state
+from tests.support import run_python
 from tests.waiting import LIMIT_S, wait_for
 
 BAD = {"health": "degraded", "cause": "yoke is silent"}
@@ -330,12 +329,12 @@ def test_a_yaml_that_is_saved_while_an_alert_is_open_does_not_begin_it_again(ser
     publisher.start()
     try:
         for k in range(30):
-            send(page, k, 50.0)
+            push(page, (k, 50.0))
         wait_for(lambda: len(told()) == 1)
         first, page.engine.twin = publisher._parts, started({"log": receiver}, f"[{{health: stale}}, {rule}]")
         wait_for(lambda: publisher._parts is not first)
         for k in range(30, 80):
-            send(page, k, 40.0)
+            push(page, (k, 40.0))
         wait_for(lambda: len(told()) == 2)
     finally:
         publisher.stop()
@@ -345,11 +344,7 @@ def test_a_yaml_that_is_saved_while_an_alert_is_open_does_not_begin_it_again(ser
 
 def test_a_killed_process_is_followed_by_one_that_resolves_its_alert(tmp_path):
     for arguments in (("0", "50.0", "1"), ("60", "40.0", "2")):
-        ended = subprocess.run(
-            [sys.executable, "-c", RUN, str(tmp_path), *arguments],
-            cwd=ROOT, text=True, capture_output=True, timeout=LIMIT_S,
-        )  # fmt: skip
-        assert ended.returncode == -signal.SIGKILL, ended.stderr
+        run_python(RUN, tmp_path, *arguments, status=-signal.SIGKILL, timeout=LIMIT_S)
     told = kept_in(tmp_path / "alerts")[1]()
     assert [alert["status"] for alert in told] == ["firing", "resolved"]
     assert told[0]["id"] == told[1]["id"] and told[0]["since"] == told[1]["since"]

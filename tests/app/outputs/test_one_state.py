@@ -23,13 +23,13 @@ from sources.source import ignore
 from tests import ROOT
 from tests.app.outputs.broker import Broker, Listener
 from tests.app.outputs.modbus_device import Device
+from tests.app.outputs.pushed import BEGIN, push, pushed_twin
 from tests.app.outputs.test_alerts import state
-from tests.app.scripted import pull_all
+from tests.app.scripted import notice_texts, pull_all
 from tests.cases import cases
 from tests.support import SECOND, free_port
 from tests.waiting import wait_for
 
-BEGIN = 1_767_225_600 * SECOND
 VALUES = (40.25, 41.5, 42.125, 41.75)
 """Exact in float32, so that a frame of the bus carries them."""
 
@@ -51,9 +51,7 @@ class Plant:
         self.closing = []
 
     def post(self, page):
-        for k, value in enumerate(VALUES):
-            message = {"time": BEGIN + k * SECOND, "values": {"winding": value}}
-            assert page.post("/api/readings", **message)[1]["accepted"] == 1
+        push(page, *enumerate(VALUES))
 
     def source(self, kind):
         if kind == "mqtt":
@@ -155,8 +153,7 @@ def test_the_same_state_from_every_output_whatever_the_source(serve, tmp_path, k
     plant, port, dbc = Plant(tmp_path, broker), free_port(), tmp_path / "estimate.dbc"
     bus = {"interface": "virtual", "channel": plant.channel, "id": 1536, "dbc": str(dbc)}
     outputs = {"every": 0, "mqtt": {"host": "127.0.0.1", "port": broker.port}, "opcua": {"port": port}, "can": bus}
-    given = {"source": json.dumps(plant.source(kind)), "outputs": json.dumps(outputs), "time.tick": "1000"}
-    twin = load_twin("motor_winding", overrides=given)
+    twin = pushed_twin(outputs, json.dumps(plant.source(kind)))
     page = serve(twin=twin, behind=lambda _: twin.open_source(ignore))
     publisher = page.engine.published = Publisher(page.engine)
     publisher.start()
@@ -268,14 +265,12 @@ def test_a_port_in_use_is_reported_and_delays_nothing(serve, tmp_path):
     import socket
 
     with socket.create_server(("127.0.0.1", 0)) as taken:
-        outputs = {"opcua": {"port": taken.getsockname()[1]}}
-        given = {"source": "{type: push}", "outputs": json.dumps(outputs), "time.tick": "1000"}
-        twin = load_twin("motor_winding", overrides=given)
+        twin = pushed_twin({"opcua": {"port": taken.getsockname()[1]}})
         page = serve(twin=twin, behind=lambda _: twin.open_source(ignore))
         publisher = Publisher(page.engine)
         publisher.start()
         Plant(tmp_path, None).post(page)
-        wait_for(lambda: any("is not served" in line.text for line in page.engine.notices.since(0)))
+        wait_for(lambda: any("is not served" in text for text in notice_texts(page.engine)))
         assert not publisher.json()["outputs"][0]["connected"]
         wait_for(lambda: page.rows() == len(VALUES))
         publisher.stop()

@@ -9,7 +9,7 @@ from app.outputs.fleet_archive import FleetArchive
 from app.outputs.parts import ArchivePlan, parts_of
 from app.twin.twin import load_twin
 from app.views.recording.rrd_file import parse_split
-from estimators.log import Events
+from estimators.log import READING, Events
 
 BEGIN, SECOND = 1_767_225_600 * 10**9, 10**9
 SPLIT = parse_split("64MB,1h,day", None, "--archive")
@@ -29,8 +29,7 @@ class Written:
         """Put rows at consecutive seconds, whose value is their number."""
         number = np.arange(first, first + count)
         t = BEGIN + number * SECOND
-        zero = np.zeros(count, np.int32)
-        self.archive.put(number % 5, Events(t, t, zero.astype(np.int8), zero, number[:, None].astype(float)))
+        self.archive.put(number % 5, Events.alike(READING, t, number.astype(float)))
         self.archive.look()
         return self
 
