@@ -19,7 +19,7 @@ from sources.can.log import CanLog
 from sources.source import Channel
 from sources.tables.table import Table
 from tests.sources import readers_that_fail
-from tests.sources.can.can_tools import Reports, dbc, sensor
+from tests.sources.can.can_tools import Reports, dbc, decoding, sensor
 from tests.sources.can.test_log import decoder_of, messages, read, write  # noqa: F401  a fixture
 from tests.support import read_all
 
@@ -227,7 +227,7 @@ def test_a_signal_that_a_message_never_carries_is_named(tmp_path):
     path = tmp_path / "a.log"
     write(path, [frame(259, bytes([1, 13, 50, 0, 0, 0, 0, 0]), t=1e9 + k, bus=0) for k in range(30)])
     channels = [sensor(0, "MUX", "Speed"), sensor(1, "MUX", "Revs")]
-    _, reports = read(path, Decoder([(dbc(tmp_path), None)], channels, width=1))
+    _, reports = read(path, decoding(tmp_path, channels))
     assert reports.counts == {"never seen": 1}
     assert reports.texts["never seen"].startswith("a.log: sensor1: MUX (0x103) was received 30 times, never with Revs;")
 

@@ -4,16 +4,14 @@ import numpy as np
 import pytest
 
 from estimators.errors import SourceError
-from estimators.log import Events
+from estimators.log import READING, Events
 from sources.merged import MemorySource, Merged
 from tests.sources.can.can_tools import same
 from tests.support import read_all
 
 
 def events(times, who):
-    n = len(times)
-    t = np.array(times, np.int64)
-    return Events(t, t, np.zeros(n, np.int8), np.full(n, who, np.int32), np.arange(n, dtype=float)[:, None])
+    return Events.alike(READING, np.array(times, np.int64), np.arange(len(times), dtype=float), who)
 
 
 @pytest.mark.parametrize("seed", range(20))

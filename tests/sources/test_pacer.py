@@ -5,7 +5,7 @@ import threading
 import numpy as np
 import pytest
 
-from estimators.log import Events
+from estimators.log import READING, Events
 from sources.merged import MemorySource
 from sources.pacer import MAX_BATCH_EVENTS, Pacer
 from tests.support import SECOND, Clock, read_all
@@ -13,9 +13,8 @@ from tests.waiting import LIMIT_S
 
 
 def events(times):
-    n = len(times)
     t = np.array([round(100 * SECOND + x * SECOND) for x in times], np.int64)
-    return Events(t, t, np.zeros(n, np.int8), np.zeros(n, np.int32), np.arange(n, dtype=float)[:, None])
+    return Events.alike(READING, t, np.arange(t.size, dtype=float))
 
 
 def player(times=(0, 1, 2, 3, 4, 5), *, batch=2, **more):

@@ -5,17 +5,16 @@ import pytest
 from app.twin.twin import load_twin
 from config.loader import shipped
 from estimators.pieces import LOOP, Piece
-from sources.can.decoder import Decoder
 from sources.can.signals import extract, extract_signature
 from sources.mapping import emit, emit_signature
 from sources.pieces import FRAMES, VALUES, function_of, is_made, make, needs, pieces_of
-from tests.sources.can.can_tools import dbc, frame, sensor
+from tests.sources.can.can_tools import decoding, frame, sensor
 from tests.sources.tables.test_table import HEADER, table, write
 from tests.support import read_all
 
 
 def test_frames_and_rows_run_what_the_pieces_are(tmp_path):
-    decoder = Decoder([(dbc(tmp_path), None)], [sensor(0, "ENGINE", "Temp")], width=1)
+    decoder = decoding(tmp_path, [sensor(0, "ENGINE", "Temp")])
     assert len(decoder.decode(decoder.gather([frame(256, bytes(8))], None))) == 1
     assert len(decoder.decode(decoder.gather([frame(256, bytes(8))] * 3, [1, 2, 3]))) == 3
     assert len(read_all(table(write(tmp_path, HEADER + "0.1,20,1,2,1,3,7\n")))) == 4

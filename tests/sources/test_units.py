@@ -7,6 +7,7 @@ import pytest
 
 from estimators.errors import SourceError
 from sources.units import conversion, declared_conversion, heading_unit
+from tests.support import error_of
 
 
 def test_spellings_of_plants_buses_and_files_convert_by_the_table_or_are_refused():
@@ -47,9 +48,7 @@ def test_what_is_refused_says_why(given, reason):
     ],
 )
 def test_what_does_not_convert_names_both(given, wanted, expected):
-    with pytest.raises(SourceError) as caught:
-        conversion(given, wanted, "speed")
-    assert str(caught.value) == expected
+    assert error_of(SourceError, conversion, given, wanted, "speed") == expected
 
 
 @pytest.mark.parametrize(

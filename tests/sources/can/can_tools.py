@@ -7,6 +7,7 @@ from typing import Any
 import can
 
 from estimators.log import READING, Events
+from sources.can.decoder import Decoder
 from sources.source import Channel
 
 DBC = """VERSION ""
@@ -61,6 +62,11 @@ def dbc(folder: Path, text: str = DBC, name: str = "test.dbc") -> Path:
     path = folder / name
     path.write_text(text)
     return path
+
+
+def decoding(folder: Path, channels: list[Channel], width: int = 1, **more: Any) -> Decoder:
+    """A decoder of channels of the small DBC."""
+    return Decoder([(dbc(folder), None)], channels, width=width, **more)
 
 
 def sensor(index: int, message: str, *signals: str, **more: Any) -> Channel:

@@ -13,8 +13,8 @@ from estimators.errors import SourceError
 from estimators.log import Events
 from sources.can.bus import LOSS_PERIOD_S, RECONNECT_WAITS_S, CanBus, open_bus
 from sources.can.decoder import Decoder
-from tests.sources.can.can_tools import DBC, Reports, dbc, frame, sensor
-from tests.support import Clock, free_port
+from tests.sources.can.can_tools import DBC, Reports, dbc, decoding, frame, sensor
+from tests.support import Clock, error_of, free_port
 from tests.waiting import wait_for
 
 DATA = bytes.fromhex("f4010fa000000080")
@@ -40,7 +40,7 @@ class FakeBus:
 
 @pytest.fixture
 def decoder(tmp_path):
-    return Decoder([(dbc(tmp_path), None)], [sensor(0, "ENGINE", "Temp")], width=1)
+    return decoding(tmp_path, [sensor(0, "ENGINE", "Temp")])
 
 
 def listen(bus, count):
@@ -84,10 +84,8 @@ def test_what_is_queued_is_taken_at_once(decoder):
 
 def test_a_bus_that_cannot_be_opened_is_one_line(decoder):
     for interface, channel in (("no_such", 0), ("socketcan", "no_such_can"), ("udp_multicast", "not a group")):
-        with pytest.raises(SourceError) as caught:
-            CanBus(interface, channel, decoder)
-        text = str(caught.value)
-        assert text.startswith(f"CAN bus {interface}:{channel}: it cannot be opened") and "\n" not in text
+        text = error_of(SourceError, CanBus, interface, channel, decoder)
+        assert text.startswith(f"CAN bus {interface}:{channel}: it cannot be opened")
 
 
 def test_one_bad_packet_is_counted_and_the_bus_stays(decoder):

@@ -10,7 +10,8 @@ from estimators.log import INPUT, READING, TRUTH
 from sources.can.decoder import Decoder, ends_of
 from sources.source import Accuracy, Channel, Condition
 from tests.cases import cases
-from tests.sources.can.can_tools import DBC, Reports, dbc, frame, sensor
+from tests.sources.can.can_tools import DBC, Reports, dbc, decoding, frame, sensor
+from tests.support import error_of
 
 
 def random_dbc(rng):
@@ -98,7 +99,7 @@ def test_extended_multiplexing_as_cantools_does(tmp_path):
 
 def test_a_signal_behind_the_frames_end_is_missing_and_counted(tmp_path):
     reports = Reports()
-    decoder = Decoder([(dbc(tmp_path), None)], [sensor(0, "ENGINE", "Temp", "Torque")], width=2, report=reports)
+    decoder = decoding(tmp_path, [sensor(0, "ENGINE", "Temp", "Torque")], width=2, report=reports)
     batch = decoder.decode(decoder.gather([frame(256, b"\xf4\x01\x00")], None))
     assert batch.value[0, 0] == 10.0 and np.isnan(batch.value[0, 1])
     assert reports.counts == {"short frame sensor0": 1}
@@ -110,7 +111,7 @@ def test_units_scale_offset_and_conditions(tmp_path):
         sensor(0, "ENGINE", "Rpm", model_units=("rad/s",), scale=(-1.0,), offset=(5.0,)),
         sensor(1, "ENGINE", "Temp", model_units=("K",), where=(Condition("Ok", 1, 1),)),
     ]
-    decoder = Decoder([(dbc(tmp_path), None)], channels, width=1, report=reports)
+    decoder = decoding(tmp_path, channels, report=reports)
     good = frame(256, bytes.fromhex("f401 0fa0 0000 0080".replace(" ", "")))
     bad = frame(256, bytes.fromhex("f401 0fa0 0000 0000".replace(" ", "")))
     batch = decoder.decode(decoder.gather([good, bad], None))
@@ -129,7 +130,7 @@ def test_inputs_of_a_frame_are_one_event_before_its_readings_and_truths(tmp_path
         Channel(INPUT, 2, "rpm", ("Rpm",), "ENGINE"),
         Channel(INPUT, 0, "ok", ("Ok",), "ENGINE"),
     ]
-    decoder = Decoder([(dbc(tmp_path), None)], channels, width=3)
+    decoder = decoding(tmp_path, channels, width=3)
     batch = decoder.decode(decoder.gather([frame(256, bytes.fromhex("f4010fa001000080"), t=2.5)], [77]))
     assert batch.kind.tolist() == [INPUT, READING, TRUTH]
     assert batch.channel.tolist() == [0, 1, 2]
@@ -139,7 +140,7 @@ def test_inputs_of_a_frame_are_one_event_before_its_readings_and_truths(tmp_path
 
 
 def test_other_frames_are_rejected_before_decoding(tmp_path):
-    decoder = Decoder([(dbc(tmp_path), None)], [sensor(0, "ENGINE", "Temp"), sensor(1, "WIDE", "Ratio")], width=1)
+    decoder = decoding(tmp_path, [sensor(0, "ENGINE", "Temp"), sensor(1, "WIDE", "Ratio")])
     assert [f["can_id"] for f in decoder.filters] == [256, 512] and decoder.filters[1]["extended"]
     data = bytes(8)
     error = can.Message(arbitration_id=256, is_extended_id=False, is_error_frame=True)
@@ -165,7 +166,7 @@ def test_a_database_holds_on_its_own_bus(tmp_path):
 
 
 def test_a_float_that_is_nan_and_one_that_is_infinite_are_missing(tmp_path):
-    decoder = Decoder([(dbc(tmp_path), None)], [sensor(0, "WIDE", "Ratio")], width=1)
+    decoder = decoding(tmp_path, [sensor(0, "WIDE", "Ratio")])
     values = [1.5, np.nan, np.inf, -np.inf]
     messages = [frame(512, np.float64(v).tobytes(), extended=True) for v in values]
     batch = decoder.decode(decoder.gather(messages, None))
@@ -175,7 +176,7 @@ def test_a_float_that_is_nan_and_one_that_is_infinite_are_missing(tmp_path):
 def test_positions_become_metres_from_the_first_valid_fix(tmp_path):
     reports = Reports()
     channel = sensor(0, "FIX", "Lat", "Lon", convert="east_north", model_units=("m", "m"))
-    decoder = Decoder([(dbc(tmp_path), None)], [channel], width=2, report=reports)
+    decoder = decoding(tmp_path, [channel], width=2, report=reports)
     fixes = [(200.0, 10.0), (56.0, 10.0), (56.001, 10.0), (56.0, 10.001)]
     raw = [np.round(np.array(fix) * 1e7).astype("<i4").tobytes() for fix in fixes]
     batch = decoder.decode(decoder.gather([frame(258, data) for data in raw], None))
@@ -203,17 +204,13 @@ def test_positions_become_metres_from_the_first_valid_fix(tmp_path):
     ],
 )
 def test_what_the_dbc_lacks_is_one_line(tmp_path, channel, expected):
-    with pytest.raises(SourceError) as caught:
-        Decoder([(dbc(tmp_path), None)], [channel], width=1)
-    assert str(caught.value).startswith(expected) and "\n" not in str(caught.value)
+    assert error_of(SourceError, decoding, tmp_path, [channel]).startswith(expected)
 
 
 @pytest.mark.parametrize("text", ["", "BO_ nonsense", "\x00\x01"])
 def test_a_file_that_is_no_dbc_is_one_line(tmp_path, text):
     path = dbc(tmp_path, text)
-    with pytest.raises(SourceError) as caught:
-        Decoder([(path, None)], [sensor(0, "ENGINE", "Temp")], width=1)
-    assert str(path.name) in str(caught.value) and "\n" not in str(caught.value)
+    assert str(path.name) in error_of(SourceError, Decoder, [(path, None)], [sensor(0, "ENGINE", "Temp")], width=1)
     with pytest.raises(SourceError, match="check the path of the DBC"):
         Decoder([(tmp_path / "absent.dbc", None)], [], width=1)
 
@@ -289,7 +286,7 @@ def test_an_accuracy_is_no_value_of_its_sensor(tmp_path):
         READING, 0, "gnss", ("Temp", "Rpm"), "ENGINE", units=("deg", "deg"), model_units=("m", "m"),
         convert="east_north", accuracy=accuracy,
     )  # fmt: skip
-    decoder = Decoder([(dbc(tmp_path), None)], [place], width=2)
+    decoder = decoding(tmp_path, [place], width=2)
     database = cantools.database.load_file(dbc(tmp_path), strict=False)
     for latitude, missing in ((200.0, True), (50.0, False)):
         data = database.encode_message("ENGINE", {"Temp": latitude, "Rpm": 10.0, "Torque": 3.0, "Ok": 1})
@@ -302,7 +299,7 @@ def test_an_accuracy_is_no_value_of_its_sensor(tmp_path):
 def test_variances_convert_by_the_square(tmp_path, unit, square):
     accuracy = Accuracy(("Torque",), squared=True, units=(unit,), scale=(2.0,))
     fix = Channel(READING, 0, "engine", ("Temp",), "ENGINE", units=("m",), model_units=("m",), accuracy=accuracy)
-    decoder = Decoder([(dbc(tmp_path), None)], [fix], width=1)
+    decoder = decoding(tmp_path, [fix])
     database = cantools.database.load_file(dbc(tmp_path), strict=False)
     data = database.encode_message("ENGINE", {"Temp": 20.0, "Rpm": 0.0, "Torque": 3.0, "Ok": 1})
     batch = decoder.decode(decoder.gather([frame(256, data)], None))
@@ -313,7 +310,7 @@ def test_an_accuracy_of_another_dimension_is_refused(tmp_path):
     accuracy = Accuracy(("Torque",), squared=True, units=("m",))
     fix = Channel(READING, 0, "engine", ("Temp",), "ENGINE", units=("m",), model_units=("m",), accuracy=accuracy)
     with pytest.raises(SourceError, match=r"engine: Torque: 'm' does not convert to the model's '\(m\)\*\*2'"):
-        Decoder([(dbc(tmp_path), None)], [fix], width=1)
+        decoding(tmp_path, [fix])
 
 
 @cases(__file__, "limits.csv")

@@ -17,8 +17,8 @@ from sources.can.decoder import Decoder
 from sources.can.log import CanLog
 from sources.source import Channel, Condition
 from sources.units import to_ns
-from tests.sources.can.can_tools import Reports, dbc, frame, same, sensor
-from tests.support import read_all
+from tests.sources.can.can_tools import Reports, dbc, decoding, frame, same, sensor
+from tests.support import error_of, read_all
 from tests.waiting import LIMIT_S
 
 FORMATS = [".asc", ".blf", ".csv", ".db", ".log", ".mf4", ".trc"]
@@ -47,7 +47,7 @@ def write(path, messages):
 
 
 def decoder_of(tmp_path, report=lambda key, text: None):
-    return Decoder([(dbc(tmp_path), None)], [sensor(0, "ENGINE", "Temp", "Rpm", "Torque")], width=3, report=report)
+    return decoding(tmp_path, [sensor(0, "ENGINE", "Temp", "Rpm", "Torque")], width=3, report=report)
 
 
 def read(path, decoder):
@@ -171,10 +171,8 @@ def test_a_file_that_is_no_log_is_one_line(tmp_path, capfd, name, content, expec
     path = tmp_path / name
     if content is not None:
         path.write_bytes(content)
-    with pytest.raises(SourceError) as caught:
-        read_all(CanLog([path], decoder_of(tmp_path)))
-    text = str(caught.value)
-    assert text.startswith(f"{path}: {expected}") and "\n" not in text
+    text = error_of(SourceError, lambda: read_all(CanLog([path], decoder_of(tmp_path))))
+    assert text.startswith(f"{path}: {expected}")
     assert "Traceback" not in capfd.readouterr().err
 
 

@@ -14,9 +14,8 @@ from can.interfaces.udp_multicast.utils import pack_message, unpack_message
 
 from estimators.log import Events
 from sources.can.bus import CanBus
-from sources.can.decoder import Decoder
 from sources.can.sockets import CMSG_TIME, Frame, frame_socket, multicast_parser
-from tests.sources.can.can_tools import Reports, dbc, frame, same, sensor
+from tests.sources.can.can_tools import Reports, decoding, frame, same, sensor
 from tests.sources.can.test_bus import multicast  # noqa: F401  a fixture
 from tests.waiting import wait_for
 
@@ -53,7 +52,7 @@ def fields(message):
 @pytest.fixture
 def decoder(tmp_path):
     channels = [sensor(0, "ENGINE", "Temp"), sensor(1, "WIDE", "Ratio"), sensor(2, "FIX", "Lat", "Lon")]
-    return lambda report: Decoder([(dbc(tmp_path), None)], channels, width=2, report=report)
+    return lambda report: decoding(tmp_path, channels, width=2, report=report)
 
 
 def test_events_of_multicast_are_those_of_python_can(decoder, multicast):  # noqa: F811

@@ -309,8 +309,8 @@ def test_a_model_change_is_the_asset_with_other_parameters_from_then_on():
     np.testing.assert_array_equal(x[:39], y[:39])
     assert np.all(np.abs(x[39:59] - y[39:59]).max(axis=1) > 0)
     # The noise of the step is the same.
-    p = np.array([item.value for item in LORENZ.parameters])
-    u = np.array([item.default for item in LORENZ.inputs])
+    p = LORENZ.default_parameters
+    u = LORENZ.default_inputs
     told = {event: x[38].copy() for event in ("own", "changed")}
     after = {name: np.empty(LORENZ.nx) for name in told}
     for name, factor in (("own", 1.0), ("changed", 1.3)):

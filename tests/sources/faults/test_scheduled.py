@@ -1,7 +1,6 @@
 """Faults of a YAML: each against its own formula, outside its time nothing changes, and errors that name the remedy."""
 
 import numpy as np
-import pytest
 
 from app.twin.twin import load_twin
 from estimators.errors import ConfigError
@@ -12,7 +11,7 @@ from sources.faults.layer import Faults, FaultySource
 from sources.simulator import SensorPlan, Simulator
 from tests.cases import cases
 from tests.sources.can.can_tools import same
-from tests.support import read_all
+from tests.support import error_of, read_all
 
 PACK = MODELS["motor_drive"]
 SENSOR = PACK.sensors[0].name
@@ -95,10 +94,8 @@ source:
 def test_the_yaml_says_what_is_wrong_with_a_fault(tmp_path, fault, text):
     path = tmp_path / "pump.yaml"
     path.write_text(YAML.replace("{FAULT}", fault))
-    with pytest.raises(ConfigError) as error:
-        load_twin(path)
-    assert text in str(error.value) and "pump.yaml:6: source.faults[0]" in str(error.value)
-    assert "\n" not in str(error.value)
+    said = error_of(ConfigError, load_twin, path)
+    assert text in said and "pump.yaml:6: source.faults[0]" in said
 
 
 def test_the_yaml_reaches_the_simulator(tmp_path):
