@@ -6,9 +6,9 @@ from itertools import groupby
 
 import numpy as np
 
+from estimators.events.arrays import blank
 from estimators.fleet.fleet import Fleet
-
-from ..ingest import queries
+from estimators.log import TICK
 
 LENGTH_BYTES = 8
 
@@ -38,7 +38,7 @@ class SilentAssets:
                 self._states[place] = self._fleet.state(slice(place, place + 1))
             else:
                 self._fleet.restore(place, known)
-        self._fleet.add_events(places, queries(times, self._fleet.model.width))
+        self._fleet.add_events(places, blank(times, TICK, 0, self._fleet.model.width))
         self._fleet.advance()
 
     def forget(self, place: int, state: bytes) -> None:

@@ -23,6 +23,7 @@ from ..numerics.jit import (
     C1,
     F1,
     F2,
+    address_of,
     by_address,
     caller,
     f64,
@@ -103,14 +104,7 @@ def place_of(typing_context: Any, context: Any) -> Any:
     return i64(context_type), codegen
 
 
-@intrinsic
-def context_at(typing_context: Any, place: Any) -> Any:
-    """Return the context at an address."""
-
-    def codegen(lowering: Any, builder: Any, signature: Any, given: Any) -> Any:
-        return builder.inttoptr(given[0], lowering.get_value_type(context_type))
-
-    return context_type(i64), codegen
+context_at = address_of(context_type)
 
 
 def with_parameters(context: np.void, p: np.ndarray) -> np.void:

@@ -51,6 +51,7 @@ Memory, memory_of = declare_layout(
     time_of,
     scratch_size,
     count="2",  # measurements of the present time; bits of the states in alarm
+    factor="n",  # of those, by shown state
     first="3",  # bits of sensors heard; e of a contradicted prior, or 0; bits of the states that are still its own
     P0="n, n",  # a contradicted prior
     prior="Time(at, n)",  # since then
@@ -274,26 +275,13 @@ def _weigh_limits(context, own, state):
 @inlined
 def memory_flags(context, at, factor):
     """Return the bits of `Track.flags` of the states in alarm, and set the `Track.factor` of each."""
-    own, shown = memory_of(at, context.nx), shown_states(context)
+    own = memory_of(at, context.nx)
     bits = int(own.count[1])
-    for s in range(min(shown.size, MEMORY_FLAGS)):
+    for s in range(min(factor.size, MEMORY_FLAGS)):
         if bits >> s & 1 != 0:
-            factor[s] = np.sqrt(1.0 + _judged(own, context.nx, shown[s])[1])
+            factor[s] = own.factor[s]
     flags, impossible = (bits | int(own.first[2])) << MEMORY_AT, int(own.impossible[0])
     return flags | impossible << IMPOSSIBLE_AT | IMPOSSIBLE if impossible != 0 else flags
-
-
-@inlined
-def _judged(own, n, j):
-    """Return the largest W of state j over the times that are its memory, and the mean of z² - 1 there, at least 0."""
-    most = excess = 0.0
-    for k in range(LEVELS):
-        level = level_of(own.end + 8 * k * level_words(n), n)
-        if LOW < level.rho[j] < HIGH:  # ρ is 0 until two times of the level have ended
-            most = max(most, level.W[j])
-            if level.W[j] >= 0.5 * BEYOND:
-                excess = max(excess, level.excess[j])
-    return most, excess
 
 
 @part
@@ -353,10 +341,18 @@ def _weigh(time, P, estimated, level):
 
 @inlined
 def _in_alarm(context, own, before):
-    """Return the bits of the shown states whose corrections are too large over their memory."""
+    """Return the bits of the shown states whose corrections are too large over their memory, and set their factors."""
     bits, shown = 0, shown_states(context)
     for s in range(min(shown.size, MEMORY_FLAGS)):
-        beyond = 0.5 * BEYOND if before >> s & 1 else BEYOND
-        if context.graded >> s & 1 != 0 and _judged(own, context.nx, shown[s])[0] >= beyond:
+        j, beyond = shown[s], 0.5 * BEYOND if before >> s & 1 else BEYOND
+        most = excess = 0.0
+        for k in range(LEVELS):
+            level = level_of(own.end + 8 * k * level_words(context.nx), context.nx)
+            # ρ is 0 until two times of the level have ended.
+            if LOW < level.rho[j] < HIGH and level.W[j] >= 0.5 * BEYOND:
+                most = max(most, level.W[j])
+                excess = max(excess, level.excess[j])
+        if context.graded >> s & 1 != 0 and most >= beyond:
             bits |= 1 << s
+            own.factor[s] = np.sqrt(1.0 + excess)
     return bits

@@ -21,7 +21,21 @@ from ..estimator import Code, call_start
 from ..fold_kernel import fold_event
 from ..gate.rejection_runs import Rule
 from ..log import _ORDER
-from ..numerics.jit import borrowed, counts, embedded, flag_rows, flags, floats, i64, ints, jit, masks, matrix, part
+from ..numerics.jit import (
+    address_of,
+    borrowed,
+    counts,
+    embedded,
+    flag_rows,
+    flags,
+    floats,
+    i64,
+    ints,
+    jit,
+    masks,
+    matrix,
+    part,
+)
 from ..numerics.linalg import copy_vector
 from ..track import WHITENED, Track, track_type
 from .memory import (
@@ -79,12 +93,7 @@ ROWS = 2
 _plan_type = from_dtype(PLAN)
 
 
-@intrinsic
-def _plan_at(typing_context, place):
-    def codegen(lowering, builder, signature, given):
-        return builder.inttoptr(given[0], lowering.get_value_type(_plan_type))
-
-    return _plan_type(i64), codegen
+_plan_at = address_of(_plan_type)
 
 
 _TAKE = {

@@ -13,7 +13,7 @@ from ..numerics.linalg import congruence, copy_vector, mirror, multiply_transpos
 from ..numerics.simd import dot
 from ..numerics.simd_ir import LANES
 from ..numerics.simd_rows import multiply_rows
-from ..numerics.workspace import declare_layout, size_of, start_of
+from ..numerics.workspace import declare_layout, start_of
 from ..track import FAILED, USED
 from ..tuning import Tuning
 from .robust import (
@@ -44,6 +44,7 @@ from .shared import (
     reading_of,
     start,
     state_size,
+    work_of,
     wrap_mean,
 )
 
@@ -78,9 +79,7 @@ Updating, updating = declare_layout(
 )
 
 
-def work_size(options: Options, nx: int, ny: int) -> int:
-    """Return the scratch of a prediction or an update."""
-    return max(size_of(predicting, nx), size_of(updating, nx, ny))
+work_size = work_of(predicting, updating)
 
 
 def tune(values: Options, model: StateSpaceModel, tuning: Tuning) -> np.ndarray:

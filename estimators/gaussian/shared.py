@@ -6,6 +6,9 @@ differ only in how mean and covariance pass through f and h; gate, verdict, NIS 
 
 from __future__ import annotations
 
+from collections.abc import Callable
+from typing import Any
+
 import numpy as np
 
 from ..compiled.context import circular_rows, circular_states, shown_states
@@ -17,7 +20,7 @@ from ..numerics.linalg import EPSILON, cholesky, mirror, solve_transposed, solve
 from ..numerics.simd import add_scaled, scaled
 from ..numerics.simd_ir import LANES, padded
 from ..numerics.simd_rows import multiply_rows, subtract_product, subtract_squares
-from ..numerics.workspace import declare_layout, start_of, take_matrix, take_vector
+from ..numerics.workspace import declare_layout, size_of, start_of, take_matrix, take_vector
 from ..track import FAILED, MISSING, USED, WHITENED
 from .robust import forget, is_robust, reweigh
 
@@ -25,6 +28,11 @@ from .robust import forget, is_robust, reweigh
 def state_size(options: Options, nx: int) -> int:
     """Return the size of the state."""
     return nx + nx * nx
+
+
+def work_of(predicting: Callable[..., Any], updating: Callable[..., Any]) -> Callable[[Options, int, int], int]:
+    """Return the function of the scratch of a prediction or an update, of their layouts."""
+    return lambda options, nx, ny: max(size_of(predicting, nx), size_of(updating, nx, ny))
 
 
 @inlined

@@ -8,13 +8,13 @@ import numpy as np
 
 from ..compiled.context import estimated, expect, sensor_rows, transition
 from ..compiled.jacobians import scratch_size, sensor_jacobian, state_jacobian
-from ..estimator import FACTOR, TANGENT, Options, SmoothingRule
+from ..estimator import FACTOR, TANGENT, SmoothingRule
 from ..numerics.jit import by_address, inlined, part
 from ..numerics.linalg import triangularise
-from ..numerics.workspace import declare_layout, size_of, start_of, take_matrix
+from ..numerics.workspace import declare_layout, start_of, take_matrix
 from .ekf import EKF
 from .robust import OPTIONS, growth
-from .shared import moments_of, move_to
+from .shared import moments_of, move_to, work_of
 from .square_root import condition, conditioning, describe, moments, noise_root, settle, start
 
 Predicting, predicting = declare_layout(
@@ -42,9 +42,7 @@ Updating, updating = declare_layout(
 )
 
 
-def work_size(options: Options, nx: int, ny: int) -> int:
-    """Return the scratch of a prediction or an update."""
-    return max(size_of(predicting, nx), size_of(updating, nx, ny))
+work_size = work_of(predicting, updating)
 
 
 @inlined

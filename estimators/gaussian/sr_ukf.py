@@ -19,9 +19,9 @@ from ..numerics.jit import by_address, inlined
 from ..numerics.linalg import remove, triangularise
 from ..numerics.simd_ir import padded
 from ..numerics.simd_rows import spread_points
-from ..numerics.workspace import declare_layout, size_of, start_of
+from ..numerics.workspace import declare_layout, start_of
 from .robust import growth
-from .shared import moments_of
+from .shared import moments_of, work_of
 from .square_root import condition, conditioning, describe, moments, noise_root, settle, start
 from .ukf import UKF, deviations, weights, weights_of
 
@@ -60,9 +60,7 @@ Updating, updating = declare_layout(
 )
 
 
-def work_size(options: Options, nx: int, ny: int) -> int:
-    """Return the scratch of a prediction or an update."""
-    return max(size_of(predicting, nx), size_of(updating, nx, ny))
+work_size = work_of(predicting, updating)
 
 
 @inlined

@@ -29,7 +29,7 @@ from ..numerics.jit import by_address, inlined, jit
 from ..numerics.linalg import EPSILON, wrap
 from ..numerics.simd_ir import padded
 from ..numerics.simd_rows import centre, covariance, cross_covariance, factor, spread_points
-from ..numerics.workspace import declare_layout, size_of, start_of
+from ..numerics.workspace import declare_layout, start_of
 from ..track import FAILED, USED
 from ..tuning import Tuning
 from .robust import OPTIONS, OWN, adapt, add_noise, is_adaptive, memory, reading_variances, shared_options
@@ -45,6 +45,7 @@ from .shared import (
     reading_of,
     start,
     state_size,
+    work_of,
     wrap_mean,
 )
 
@@ -97,9 +98,7 @@ Updating, updating = declare_layout(
 )
 
 
-def work_size(options: Options, nx: int, ny: int) -> int:
-    """Return the scratch of a prediction or an update."""
-    return max(size_of(predicting, nx), size_of(updating, nx, ny))
+work_size = work_of(predicting, updating)
 
 
 @by_address

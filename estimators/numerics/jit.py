@@ -192,24 +192,23 @@ def caller(signature: Any) -> Any:
     return call
 
 
-def _pointer_to(element: Any) -> Any:
-    """Return a function for compiled code that reads an integer as a pointer to `element`s."""
+def address_of(pointer: Any) -> Any:
+    """Return a function for compiled code that reads an integer as an address, as of a `pointer` or a record."""
 
     @intrinsic
-    def pointer(typing_context: Any, target: Any) -> Any:
+    def read(typing_context: Any, target: Any) -> Any:
         def codegen(context: Any, builder: Any, signature: Any, given: Any) -> Any:
             return builder.inttoptr(given[0], context.get_value_type(signature.return_type))
 
-        return types.CPointer(element)(i64), codegen
+        return pointer(i64), codegen
 
-    return pointer
+    return read
 
 
-_to_float = _pointer_to(types.float64)
-_to_int = _pointer_to(types.int64)
-_to_byte = _pointer_to(types.int8)
-_to_mask = _pointer_to(types.int32)
-_to_complex = _pointer_to(types.complex128)
+_to_float, _to_int, _to_byte, _to_mask, _to_complex = (
+    address_of(types.CPointer(element))
+    for element in (types.float64, types.int64, types.int8, types.int32, types.complex128)
+)
 
 
 @embedded
