@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 
 from .ensemble.enkf import ENKF
 from .ensemble.ensrf import ENSRF
@@ -80,20 +80,19 @@ def checked(entry: Estimator, model: StateSpaceModel, options: Mapping[str, floa
 def unfit(entry: Estimator, model: StateSpaceModel) -> str | None:
     """Return why an estimator does not apply to a model, or None: its own reason, or the size of its state."""
     if model.black_box and entry.blocks is None and not entry.interpreted:
-        able = ", ".join(e.name for e in ESTIMATORS.values() if e.interpreted or e.blocks is not None)
         return (
             f"{model.name} is a black box, whose f and h run on blocks of states and are not compiled; {entry.name} "
-            f"needs compiled ones; use {able}"
+            f"needs compiled ones; use {_those(lambda e: e.interpreted or e.blocks is not None)}"
         )
     if model.certain and not entry.singular:
         return (
             f"in {model.name} {model.certain}, and {entry.name} takes no singular covariance; give it a small "
-            f"variance, or use {', '.join(e.name for e in ESTIMATORS.values() if e.singular)}"
+            f"variance, or use {_those(lambda e: e.singular)}"
         )
     if model.considered and not entry.considers:
         return (
             f"{model.name} has parameters to consider, which {entry.name} cannot; hold or estimate them, or use "
-            f"{', '.join(e.name for e in ESTIMATORS.values() if e.considers)}"
+            f"{_those(lambda e: e.considers)}"
         )
     if entry.family == "ensemble":
         return entry.applies(model)
@@ -107,6 +106,10 @@ def unfit(entry: Estimator, model: StateSpaceModel) -> str | None:
     if model.shape is not None:
         return f"{model.name} gives its noise as a shape, not as a matrix; use an ensemble filter"
     return entry.applies(model)
+
+
+def _those(able: Callable[[Estimator], object]) -> str:
+    return ", ".join(e.name for e in ESTIMATORS.values() if able(e))
 
 
 def _gigabytes(numbers: int) -> str:

@@ -23,7 +23,6 @@ from ..numerics.jit import (
     C1,
     F1,
     F2,
-    address_of,
     by_address,
     caller,
     f64,
@@ -36,6 +35,7 @@ from ..numerics.jit import (
     linkable_embedded,
     matrix,
     part,
+    pointer,
 )
 
 f_signature = types.void(F1, F1, F1, f64, F1)
@@ -104,7 +104,7 @@ def place_of(typing_context: Any, context: Any) -> Any:
     return i64(context_type), codegen
 
 
-context_at = address_of(context_type)
+context_at = pointer(context_type)
 
 
 def with_parameters(context: np.void, p: np.ndarray) -> np.void:

@@ -52,10 +52,11 @@ Memory, memory_of = declare_layout(
     scratch_size,
     count="2",  # measurements of the present time; bits of the states in alarm
     factor="n",  # of those, by shown state
-    first="3",  # bits of sensors heard; e of a contradicted prior, or 0; bits of the states that are still its own
+    # bits of sensors heard; e of a contradicted prior, or 0; bits of the states that are still its own; bits of the
+    # impossible states, and of those that only the model has made possible again
+    first="4",
     P0="n, n",  # a contradicted prior
     prior="Time(at, n)",  # since then
-    impossible="1",  # bits of the states that are it, or would be it but for the model's own motion
     possible="Time(at, n)",  # since an estimate was impossible; d: less the forecast from its limit
     now="Time(at, n)",
     joined="Time(at, n)",
@@ -135,7 +136,6 @@ def forget_memory(at, n):
     own = memory_of(at, n)
     own.count[0] = own.count[1] = 0.0
     own.first[:] = 0.0
-    own.impossible[0] = 0.0
     _clear(own.now)
     for k in range(LEVELS):
         level = level_of(own.end + 8 * k * level_words(n), n)
@@ -153,7 +153,7 @@ def carry_memory(context, at, x, u, dt):
     _carry(own.F, estimated(context), own.now, own.products)
     if own.first[1] > 0.0:
         _carry(own.F, estimated(context), own.prior, own.products)
-    if own.impossible[0] > 0.0:
+    if own.first[3] > 0.0:
         _carry(own.F, estimated(context), own.possible, own.products)
 
 
@@ -196,7 +196,7 @@ def after_update(context, at, state, sensor, innovation, std):
     if own.first[1] > 0.0:
         _correct(own.prior, own.x, own.F)
         _weigh_prior(context, own)
-    if own.impossible[0] > 0.0:
+    if own.first[3] > 0.0:
         _correct(own.possible, own.x, own.F)
     _weigh_limits(context, own, state)
     own.count[0] += 1.0
@@ -255,7 +255,7 @@ def _weigh_limits(context, own, state):
     If the true state was at the limit when the estimate was impossible, it has moved since as the model predicts. d is
     the estimate less that forecast, and P + D the variance of the forecast: |d| > 1.96 √(P + D).
     """
-    shown, bits = shown_states(context), int(own.impossible[0])
+    shown, bits = shown_states(context), int(own.first[3])
     ranges, found = floats(context.ranges, 6 * shown.size), 0
     for s in range(min(shown.size, MEMORY_FLAGS)):
         j = shown[s]
@@ -269,7 +269,7 @@ def _weigh_limits(context, own, state):
             own.possible.D[:] = 0.0
         if abs(left) > HALF_WIDTH * np.sqrt(own.P[j, j] + own.possible.D[j, j]):
             found |= 1 << s
-    own.impossible[0] = found
+    own.first[3] = found
 
 
 @inlined
@@ -280,7 +280,7 @@ def memory_flags(context, at, factor):
     for s in range(min(factor.size, MEMORY_FLAGS)):
         if bits >> s & 1 != 0:
             factor[s] = own.factor[s]
-    flags, impossible = (bits | int(own.first[2])) << MEMORY_AT, int(own.impossible[0])
+    flags, impossible = (bits | int(own.first[2])) << MEMORY_AT, int(own.first[3])
     return flags | impossible << IMPOSSIBLE_AT | IMPOSSIBLE if impossible != 0 else flags
 
 

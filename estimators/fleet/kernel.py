@@ -21,21 +21,7 @@ from ..estimator import Code, call_start
 from ..fold_kernel import fold_event
 from ..gate.rejection_runs import Rule
 from ..log import _ORDER
-from ..numerics.jit import (
-    address_of,
-    borrowed,
-    counts,
-    embedded,
-    flag_rows,
-    flags,
-    floats,
-    i64,
-    ints,
-    jit,
-    masks,
-    matrix,
-    part,
-)
+from ..numerics.jit import borrowed, counts, embedded, flag_rows, flags, floats, ints, jit, masks, matrix, part, pointer
 from ..numerics.linalg import copy_vector
 from ..track import WHITENED, Track, track_type
 from .memory import (
@@ -93,7 +79,7 @@ ROWS = 2
 _plan_type = from_dtype(PLAN)
 
 
-_plan_at = address_of(_plan_type)
+_plan_at = pointer(_plan_type)
 
 
 _TAKE = {
@@ -127,7 +113,7 @@ def _prefetch_line(typing_context, place):
         builder.call(function, [pointer, word(1), word(3), word(1)])
         return lowering.get_dummy_value()
 
-    return types.void(i64), codegen
+    return types.void(types.int64), codegen
 
 
 @embedded

@@ -60,9 +60,6 @@ Updating, updating = declare_layout(
 )
 
 
-work_size = work_of(predicting, updating)
-
-
 @inlined
 def weigh_central(central, a, grown, deviation, lost, row):
     """Fill `lost` with the central point's row √|w| D₀, its `grown` entries times a; `row` too if w is positive."""
@@ -147,7 +144,7 @@ SR_UKF = replace(
     fails_when="a negative central weight outweighs the others, or the posterior has several peaks",
     source="van der Merwe & Wan (2001), doi:10.1109/ICASSP.2001.940586",
     functions=(start, predict, update, describe),
-    work_size=work_size,
+    work_size=work_of(predicting, updating),
     moments=moments,
     points=points,
     smoothing=SmoothingRule(POINTS, FACTOR),

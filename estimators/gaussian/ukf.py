@@ -98,9 +98,6 @@ Updating, updating = declare_layout(
 )
 
 
-work_size = work_of(predicting, updating)
-
-
 @by_address
 def predict(context, u, dt, index, state, work):
     """x, P ← mean and covariance of the propagated sigma points, plus Q.
@@ -218,7 +215,7 @@ UKF = Estimator(
     functions=(start, predict, update, describe),
     runs=lambda options, nx: 2 * nx + 1,
     state_size=state_size,
-    work_size=work_size,
+    work_size=work_of(predicting, updating),
     moments=moments,
     points=points,
     options=(

@@ -26,6 +26,7 @@ from math import isfinite
 import numpy as np
 
 from ..errors import ModelError
+from ..numerics.linalg import multiply
 from .parts import Row, Sensor, State
 from .state_space import Input, Noise, StateSpaceModel, squared
 
@@ -159,18 +160,6 @@ def doublings(M, dt):
     return count
 
 
-def product(A, B, out):
-    """Fill out = A B."""
-    for i in range(A.shape[0]):
-        for j in range(B.shape[1]):
-            out[i, j] = 0.0
-        for k in range(A.shape[1]):
-            a = A[i, k]
-            if a != 0.0:
-                for j in range(B.shape[1]):
-                    out[i, j] += a * B[k, j]
-
-
 def growth(M, dt, out):
     """Fill out = exp(M dt) - I, which keeps the digits of slow modes beside fast ones while it is doubled."""
     count = doublings(M, dt)
@@ -182,7 +171,7 @@ def growth(M, dt, out):
             term[i, j] = M[i, j] * h
             out[i, j] = term[i, j]
     for k in range(2, TERMS + 1):
-        product(M, term, other)
+        multiply(M, M.shape[0], term, other)
         for i in range(n):
             for j in range(n):
                 term[i, j] = other[i, j] * h / k
@@ -193,7 +182,7 @@ def growth(M, dt, out):
 
 def double_growth(G, other):
     """Fill G = (I + G)² - I, with scratch of its shape."""
-    product(G, G, other)
+    multiply(G, G.shape[0], G, other)
     for i in range(G.shape[0]):
         for j in range(G.shape[0]):
             G[i, j] = 2.0 * G[i, j] + other[i, j]
@@ -221,7 +210,7 @@ def integral(A, q, dt, out):
         term[i, i] = q[i] * h
         out[i, i] = term[i, i]
     for k in range(2, TERMS + 2):
-        product(A, term, other)
+        multiply(A, A.shape[0], term, other)
         for i in range(n):
             for j in range(i + 1):
                 term[i, j] = (other[i, j] + other[j, i]) * h / k
@@ -233,7 +222,7 @@ def integral(A, q, dt, out):
     growth(A, h, G)
     for _ in range(count):
         # F Q Fᵀ + Q with F = I + G
-        product(G, out, other)
+        multiply(G, G.shape[0], out, other)
         for i in range(n):
             for j in range(n):
                 other[i, j] += out[i, j]

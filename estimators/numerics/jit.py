@@ -192,21 +192,21 @@ def caller(signature: Any) -> Any:
     return call
 
 
-def address_of(pointer: Any) -> Any:
-    """Return a function for compiled code that reads an integer as an address, as of a `pointer` or a record."""
+def pointer(kind: Any) -> Any:
+    """Return a function for compiled code that reads an integer as an address, that of a pointer or a record."""
 
     @intrinsic
     def read(typing_context: Any, target: Any) -> Any:
         def codegen(context: Any, builder: Any, signature: Any, given: Any) -> Any:
             return builder.inttoptr(given[0], context.get_value_type(signature.return_type))
 
-        return pointer(i64), codegen
+        return kind(i64), codegen
 
     return read
 
 
 _to_float, _to_int, _to_byte, _to_mask, _to_complex = (
-    address_of(types.CPointer(element))
+    pointer(types.CPointer(element))
     for element in (types.float64, types.int64, types.int8, types.int32, types.complex128)
 )
 

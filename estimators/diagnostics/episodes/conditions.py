@@ -94,8 +94,7 @@ def left_ranges(judged: JudgedRows) -> Iterator[FoundEpisode]:
         yield from _outside(state, mean, t)
         if state.limits is not None:
             low, high = state.limits
-            proven = track.flags & memory_flag(column, IMPOSSIBLE_AT) != 0
-            rows = proven | (mean + half < low) | (mean - half > high)
+            rows = (mean + half < low) | (mean - half > high) | (track.flags & memory_flag(column, IMPOSSIBLE_AT) != 0)
             yield from _beyond(state, "impossible", rows, mean, t, state.limits)
         if state.watched:
             yield from _beyond(state, "corrected", track.flags[told] & memory_flag(column) != 0, mean[told], t[told])

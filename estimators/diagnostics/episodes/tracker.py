@@ -131,10 +131,6 @@ class TrackedEpisode(NamedTuple):
     episode: Episode
     dropped: DroppedRows = DroppedRows()
 
-    def continues_in(self, item: FoundEpisode) -> bool:
-        """Return whether an episode of the kept rows is the continuation of this one."""
-        return self.at == item.at or self.dropped.quiet + item.begin <= JOINED_ROWS.get(self.key[0], 0)
-
     def after(self, judged: JudgedRows) -> TrackedEpisode:
         """Return the same with further rows in its summary."""
         if self.key[0] not in ALARM_KEYS:
@@ -265,7 +261,8 @@ class EpisodeTracker:
             first = int(judged.events.t[0])
             for item in found_in(judged):
                 known = left.get(item.key)
-                if known is not None and known.continues_in(item):
+                joined = JOINED_ROWS.get(item.key[0], 0)
+                if known is not None and (known.at == item.at or known.dropped.quiet + item.begin <= joined):
                     del left[item.key]
                     found.append(_continued(known, item, judged))
                 else:
