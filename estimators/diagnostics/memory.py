@@ -52,9 +52,7 @@ Memory, memory_of = declare_layout(
     scratch_size,
     count="2",  # measurements of the present time; bits of the states in alarm
     factor="n",  # of those, by shown state
-    # bits of sensors heard; e of a contradicted prior, or 0; bits of the states that are still its own; bits of the
-    # impossible states, and of those that only the model has made possible again
-    first="4",
+    first="4",  # bits of sensors heard; e of a contradicted prior, or 0; bits of states that are its own, or impossible
     P0="n, n",  # a contradicted prior
     prior="Time(at, n)",  # since then
     possible="Time(at, n)",  # since an estimate was impossible; d: less the forecast from its limit
@@ -259,8 +257,7 @@ def _weigh_limits(context, own, state):
     ranges, found = floats(context.ranges, 6 * shown.size), 0
     for s in range(min(shown.size, MEMORY_FLAGS)):
         j = shown[s]
-        low, high = ranges[6 * s + 4], ranges[6 * s + 5]
-        beyond = max(state[j] - high, 0.0) + min(state[j] - low, 0.0)
+        beyond = min(state[j] - ranges[6 * s + 4], 0.0) + max(state[j] - ranges[6 * s + 5], 0.0)
         left = own.possible.d[j] if bits >> s & 1 != 0 else 0.0
         if abs(beyond) > HALF_WIDTH * np.sqrt(own.P[j, j]) and abs(beyond) > abs(left):
             if bits | found == 0:
@@ -280,8 +277,8 @@ def memory_flags(context, at, factor):
     for s in range(min(factor.size, MEMORY_FLAGS)):
         if bits >> s & 1 != 0:
             factor[s] = own.factor[s]
-    flags, impossible = (bits | int(own.first[2])) << MEMORY_AT, int(own.first[3])
-    return flags | impossible << IMPOSSIBLE_AT | IMPOSSIBLE if impossible != 0 else flags
+    bits = (bits | int(own.first[2])) << MEMORY_AT | int(own.first[3]) << IMPOSSIBLE_AT
+    return bits | IMPOSSIBLE if own.first[3] > 0.0 else bits
 
 
 @part
