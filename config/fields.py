@@ -379,10 +379,13 @@ class ValiditySection(RangeSection):
 Validity = Annotated[ValiditySection, AfterValidator(_holds_something)]
 
 
-def bounds(pair: Pair) -> tuple[float, float]:
-    """Return the two ends; infinite where one is not given."""
+def bounds(pair: Pair, own: tuple[float, float] | None = None) -> tuple[float, float]:
+    """Return the two ends; where one is not given that of `own`, unless the other is beyond; else infinite."""
     low, high = pair
-    return -math.inf if low is None else low, math.inf if high is None else high
+    least, most = own or (-math.inf, math.inf)
+    if low is None:
+        low = least if high is None or least < high else -math.inf
+    return low, high if high is not None else most if low < most else math.inf
 
 
 class StuckSection(Section):

@@ -462,12 +462,12 @@ class TwinSection(Section):
     valid: dict[str, Validity] = {}
     """Range over which the model was fitted or validated, by state or input, in its unit, for example
     {temperature: {min: 20, max: 38}}. Outside it, by more than `extrapolate`, health is suspect. A fitted
-    tuning version has the range of its recordings. Default: the model's."""
+    tuning version has the range of its recordings. An end that is not given is the model's. Default: the model's."""
     possible: dict[str, Limited] = {}
     """Physical limits of a state or an estimated parameter, in its unit, for example {level: {min: 0, max: 2.4}}. While
     the band of its estimate lies beyond, health is suspect; a forecast ends there. The prior's mean lies within, and so
-    does some of the range in `valid`. Default: the model's; kelvins and kilograms are at least 0, unless the prior's
-    mean is within 2 standard deviations of it."""
+    does some of the range in `valid`. An end that is not given is the model's. Default: the model's; kelvins and
+    kilograms are at least 0, unless the prior's mean is within 2 standard deviations of it."""
     withhold: dict[str, Positive] = {}
     """Half-width of the 95 % band of a state beyond which its estimate is withheld, in its unit, for example
     {soc: 0.2}: page, API and files then show the reason in place of a value. Default: never."""

@@ -360,7 +360,7 @@ def _possible(state: State, loaded: Loaded) -> tuple[float, float] | None:
     """
     given, positive = loaded.config.possible.get(state.name), state.unit in POSITIVE and state.mean > 2.0 * state.std
     own = state.limits or ((0.0, inf) if positive else None)
-    limits = own if given is None else bounds((given.min, given.max))
+    limits = own if given is None else bounds((given.min, given.max), own)
     for key, pair, other in (("possible", limits, own), ("valid", state.fitted, limits)):
         if pair and other and (pair[0] > other[1] or pair[1] < other[0]):
             text = f"is {_ends(pair, state)}, outside the physical limits, {_ends(other, state)}"
@@ -386,7 +386,7 @@ def _ranged(items: Any, loaded: Loaded) -> Any:
         for item in items
     )
     return tuple(
-        replace(item, fitted=bounds((own.min, own.max)), near=own.extrapolate)
+        replace(item, fitted=bounds((own.min, own.max), item.fitted), near=own.extrapolate)
         if (own := valid.get(item.name))
         else item
         for item in found

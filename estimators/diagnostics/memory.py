@@ -52,9 +52,8 @@ Memory, memory_of = declare_layout(
     scratch_size,
     count="2",  # measurements of the present time; bits of the states in alarm
     factor="n",  # of those, by shown state
-    first="4",  # bits of sensors heard; e of a contradicted prior, or 0; bits of states that are its own, or impossible
-    P0="n, n",  # a contradicted prior
-    prior="Time(at, n)",  # since then
+    first="3",  # bits of sensors heard; bits of states whose prior is wrong, and of impossible ones
+    prior="Time(at, n)",  # since a contradicted prior; d: its error
     possible="Time(at, n)",  # since an estimate was impossible; d: less the forecast from its limit
     now="Time(at, n)",
     joined="Time(at, n)",
@@ -151,7 +150,7 @@ def carry_memory(context, at, x, u, dt):
     _carry(own.F, estimated(context), own.now, own.products)
     if own.first[1] > 0.0:
         _carry(own.F, estimated(context), own.prior, own.products)
-    if own.first[3] > 0.0:
+    if own.first[2] > 0.0:
         _carry(own.F, estimated(context), own.possible, own.products)
 
 
@@ -182,21 +181,22 @@ def after_update(context, at, state, sensor, innovation, std):
     """Add a correction, and judge the times that end with it; ν and √diag S (ny,) tell whether the prior was wrong."""
     n = context.nx
     own, circular = memory_of(at, n), circular_states(context)
-    _hear(own, 1 << min(sensor, MAX_SENSORS), innovation, std)
     copy(own.P, own.F)
     _spread(context.memory, n, state, own.P)
     for i in range(n):
         moved = state[i] - own.x[i]
         own.x[i] = wrap(moved) if circular[i] != 0 else moved
+    _hear(own, 1 << min(sensor, MAX_SENSORS), innovation, std)
+    for i in range(n):
         for j in range(n):
             own.F[i, j] -= own.P[i, j]
     _correct(own.now, own.x, own.F)
-    if own.first[1] > 0.0:
-        _correct(own.prior, own.x, own.F)
-        _weigh_prior(context, own)
-    if own.first[3] > 0.0:
+    if own.first[2] > 0.0:
         _correct(own.possible, own.x, own.F)
-    _weigh_limits(context, own, state)
+    if own.first[1] > 0.0:
+        own.x[:] = 0.0
+        _correct(own.prior, own.x, own.F)
+    _weigh_proofs(context, own, state)
     own.count[0] += 1.0
     if own.count[0] >= FIRST:
         _end_time(context, at, own)
@@ -213,60 +213,56 @@ def _correct(time, moved, taken):
 
 @inlined
 def _hear(own, bit, innovation, std):
-    """Note whether the first measurement of a sensor, used or refused, contradicts the prior of what is estimated."""
-    if int(own.first[0]) & bit == 0:
+    """Note whether the first measurement of a sensor that is used contradicts the prior of the states that it moves.
+
+    Others are correlated with it by less than 1 / `MAX_Z`, so that e of its deviations are none of theirs.
+    """
+    if int(own.first[0]) & bit == 0 and own.x.any():
         own.first[0] += bit
+        e = 0.0
         for k in range(innovation.size):
-            e = abs(innovation[k]) / std[k]
-            if e > FIRST_SIGMA:
-                own.first[1] = max(own.first[1], min(e, MAX_Z))
-                copy(own.P, own.P0)
+            e = max(e, abs(innovation[k]) / std[k])
+        if e > FIRST_SIGMA:
+            if own.first[1] == 0.0:
                 _clear(own.prior)
+                own.first[1] = 1.0
+            for i in range(own.x.size):
+                sigma = np.copysign(np.sqrt(own.F[i, i]), own.x[i])
+                if MAX_Z * own.x[i] / sigma > e:
+                    own.prior.d[i] = min(e, MAX_Z) * sigma
 
 
 @inlined
-def _weigh_prior(context, own):
-    """Find the states in which a prior that is wrong by e of its deviations still leaves more than one of theirs.
+def _weigh_proofs(context, own, state):
+    """Find the states that have been proved wrong, and are not corrected yet.
 
-    The prior gives B = Φ P₀ Φᵀ of the variance P + G of a forecast from it, and measurements have left the share
-    ρ = P / (P + G) of its error: e ρ √B > √P.
+    Of a contradicted prior min(e, `MAX_Z`) of its deviations, d, were wrong, and measurements have left the share
+    ρ = P / (P + D) of them: ρ |d| > √P.
+
+    An impossible estimate may come back because the model moves it, which is no correction. If the true state was at
+    the limit, it has moved as the model predicts. d is the estimate less that forecast, and as D begins with the row
+    and column of the state in -P, P + D is the variance of the forecast. The bands of both do not meet:
+    |d| > 1.96 (√P + √(P + D)).
     """
-    bits, shown, e, Phi = 0, shown_states(context), own.first[1], own.prior.Phi
-    for s in range(min(shown.size, MEMORY_FLAGS)):
-        j = shown[s]
-        B = 0.0
-        for k in range(estimated(context)):
-            for m in range(estimated(context)):
-                B += Phi[j, k] * own.P0[k, m] * Phi[j, m]
-        forecast = own.P[j, j] + own.prior.D[j, j]
-        if context.graded >> s & 1 != 0 and e * e * B * own.P[j, j] > forecast * forecast:
-            bits |= 1 << s
-    own.first[2] = bits
-    if bits == 0:
-        own.first[1] = 0.0
-
-
-@inlined
-def _weigh_limits(context, own, state):
-    """Find the states that are beyond their limits, or inside because the model moves them, not the measurements.
-
-    If the true state was at the limit when the estimate was impossible, it has moved since as the model predicts. d is
-    the estimate less that forecast, and P + D the variance of the forecast: |d| > 1.96 √(P + D).
-    """
-    shown, bits = shown_states(context), int(own.first[3])
+    shown, prior, bits, before = shown_states(context), own.prior, 0, int(own.first[2])
     ranges, found = floats(context.ranges, 6 * shown.size), 0
     for s in range(min(shown.size, MEMORY_FLAGS)):
         j = shown[s]
+        P = own.P[j, j]
+        if own.first[1] > 0.0 and context.graded >> s & 1 != 0 and prior.d[j] ** 2 * P > (P + prior.D[j, j]) ** 2:
+            bits |= 1 << s
         beyond = min(state[j] - ranges[6 * s + 4], 0.0) + max(state[j] - ranges[6 * s + 5], 0.0)
-        left = own.possible.d[j] if bits >> s & 1 != 0 else 0.0
-        if abs(beyond) > HALF_WIDTH * np.sqrt(own.P[j, j]) and abs(beyond) > abs(left):
-            if bits | found == 0:
+        left = own.possible.d[j] if before >> s & 1 != 0 else 0.0
+        if abs(beyond) > HALF_WIDTH * np.sqrt(P) and abs(beyond) > abs(left):
+            if before | found == 0:
                 own.possible.d[:] = 0.0
             left = own.possible.d[j] = beyond
             own.possible.D[:] = 0.0
-        if abs(left) > HALF_WIDTH * np.sqrt(own.P[j, j] + own.possible.D[j, j]):
+            for k in range(own.x.size):
+                own.possible.D[j, k] = own.possible.D[k, j] = -own.P[j, k]
+        if abs(left) > HALF_WIDTH * (np.sqrt(P) + np.sqrt(max(P + own.possible.D[j, j], 0.0))):
             found |= 1 << s
-    own.first[3] = found
+    own.first[1], own.first[2] = bits, found
 
 
 @inlined
@@ -277,8 +273,8 @@ def memory_flags(context, at, factor):
     for s in range(min(factor.size, MEMORY_FLAGS)):
         if bits >> s & 1 != 0:
             factor[s] = own.factor[s]
-    bits = (bits | int(own.first[2])) << MEMORY_AT | int(own.first[3]) << IMPOSSIBLE_AT
-    return bits | IMPOSSIBLE if own.first[3] > 0.0 else bits
+    bits = (bits | int(own.first[1])) << MEMORY_AT | int(own.first[2]) << IMPOSSIBLE_AT
+    return bits | IMPOSSIBLE if own.first[2] > 0.0 else bits
 
 
 @part

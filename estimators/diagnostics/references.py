@@ -12,7 +12,7 @@ from ..events.batch import Events, truth_of
 from ..model.state_space import Input, State, StateSpaceModel
 from ..numerics.linalg import wrapped
 from ..track import HEALTH_NAMES, HELD_OUT, SUSPECT, TRACKING, WAITING, Track
-from .detectors import FAR_OUTSIDE, is_outside, memory_flag
+from .detectors import FAR_OUTSIDE, IMPOSSIBLE_AT, MEMORY_AT, is_outside, memory_flag
 
 
 class Reference(NamedTuple):
@@ -78,6 +78,11 @@ def shown_track(model: StateSpaceModel, track: Track) -> Track:
 
 
 WITHHELD = "withheld"  # Grade of a state beside those of health
+SUSPICIONS = {
+    MEMORY_AT: "corrected by more than its band allows, over its memory or from its prior",
+    IMPOSSIBLE_AT: "its band was beyond its physical limits, and measurements have not corrected it by as much",
+}
+"""Why a state is suspect by itself, by the first bit of `Track.flags` of that; the last one counts."""
 
 
 def state_grades(
@@ -121,9 +126,10 @@ def own_grades(model: StateSpaceModel, track: Track, u: np.ndarray) -> dict[str,
     ]
     why = f"outside the fitted range ({'; '.join(left)})" if left else "too uncertain"
     grades = {
-        state.name: (HEALTH_NAMES[SUSPECT], "corrected by more than its band allows, over its memory or from its prior")
+        state.name: (HEALTH_NAMES[SUSPECT], text)
         for k, state in enumerate(model.shown_states)
-        if track.flags[-1] & memory_flag(k)
+        for at, text in SUSPICIONS.items()
+        if track.flags[-1] & memory_flag(k, at)
     }
     return grades | {
         state.name: (WITHHELD, f"{why}, ± {float(f'{HALF_WIDTH * deviation:.2g}'):g}{spaced(state.unit)}")

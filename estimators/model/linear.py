@@ -26,7 +26,6 @@ from math import isfinite
 import numpy as np
 
 from ..errors import ModelError
-from ..numerics.linalg import multiply
 from .parts import Row, Sensor, State
 from .state_space import Input, Noise, StateSpaceModel, squared
 
@@ -160,6 +159,18 @@ def doublings(M, dt):
     return count
 
 
+def product(A, B, out):
+    """Fill out = A B."""
+    for i in range(A.shape[0]):
+        for j in range(B.shape[1]):
+            out[i, j] = 0.0
+        for k in range(A.shape[1]):
+            a = A[i, k]
+            if a != 0.0:
+                for j in range(B.shape[1]):
+                    out[i, j] += a * B[k, j]
+
+
 def growth(M, dt, out):
     """Fill out = exp(M dt) - I, which keeps the digits of slow modes beside fast ones while it is doubled."""
     count = doublings(M, dt)
@@ -171,7 +182,7 @@ def growth(M, dt, out):
             term[i, j] = M[i, j] * h
             out[i, j] = term[i, j]
     for k in range(2, TERMS + 1):
-        multiply(M, M.shape[0], term, other)
+        product(M, term, other)
         for i in range(n):
             for j in range(n):
                 term[i, j] = other[i, j] * h / k
@@ -182,7 +193,7 @@ def growth(M, dt, out):
 
 def double_growth(G, other):
     """Fill G = (I + G)² - I, with scratch of its shape."""
-    multiply(G, G.shape[0], G, other)
+    product(G, G, other)
     for i in range(G.shape[0]):
         for j in range(G.shape[0]):
             G[i, j] = 2.0 * G[i, j] + other[i, j]
@@ -210,7 +221,7 @@ def integral(A, q, dt, out):
         term[i, i] = q[i] * h
         out[i, i] = term[i, i]
     for k in range(2, TERMS + 2):
-        multiply(A, A.shape[0], term, other)
+        product(A, term, other)
         for i in range(n):
             for j in range(i + 1):
                 term[i, j] = (other[i, j] + other[j, i]) * h / k
@@ -222,7 +233,7 @@ def integral(A, q, dt, out):
     growth(A, h, G)
     for _ in range(count):
         # F Q Fᵀ + Q with F = I + G
-        multiply(G, G.shape[0], out, other)
+        product(G, out, other)
         for i in range(n):
             for j in range(n):
                 other[i, j] += out[i, j]

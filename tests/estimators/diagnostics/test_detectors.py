@@ -34,6 +34,8 @@ from estimators.track import (
     GATED,
     HELD_OUT,
     MISSING,
+    RANGE,
+    RATE,
     SCREENED,
     STALE,
     SUSPECT,
@@ -349,8 +351,9 @@ def by_definition(events, track, gate, baseline, expected):
                         continue
                     nu, std = track.innovation[i, k], track.innovation_std[i, k]
                     begins = row.resets(std)
-                    said = (row.said - {"stuck"}) | row.repeat(y, R[index], sensor.h, nu, std, verdict == USED)
-                    screened = track.screened[i, k] != 0
+                    said, screened = row.said, track.screened[i, k] != 0
+                    if not track.screened[i, k] & (RANGE | RATE):  # such a value is none
+                        said = (said - {"stuck"}) | row.repeat(y, R[index], sensor.h, nu, std, verdict == USED)
                     if (judged or verdict == FAILED or screened) and not begins:
                         ratio = acceptance if verdict == USED and not screened else refusal
                         said = (said - {"refused"}) | row.refusals.put(ratio, sensor.h, row.base[-2], row.said)
@@ -360,8 +363,9 @@ def by_definition(events, track, gate, baseline, expected):
                     if k == 0:
                         said = said - {"disagreeing", "agreeing"} | (together if judged else sensor.said)
                     row.said, row.grade = said, row.graded(said, gate is not None, R[index])
-                    alarms[k] = sum(1 << ALARM_NAMES.index(cause) for cause in said)
-                    alarms[k] |= ADVISORY_ALARM * (row.grade == "advisory")
+            for k, index in enumerate(ROWS[s]):
+                alarms[k] = sum(1 << ALARM_NAMES.index(cause) for cause in rows[index].said)
+                alarms[k] |= ADVISORY_ALARM * (rows[index].grade == "advisory")
         elif kind == INPUT and np.isfinite(events.value[i, 0]):
             feed = events.value[i, 0]
         elif kind == RESET:
