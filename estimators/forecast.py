@@ -104,7 +104,10 @@ def forecast(
     times = max(1, min(most, int(np.ceil(horizon / step))))
     fine = times * max(1, int(np.ceil(horizon / (times * step))))
     instants = now + np.rint(np.linspace(0.0, 1e9 * horizon, fine + 1)).astype(np.int64)
-    fold = Fold(estimator, model, tuning, _future(model, base, instants, inputs), base=base)
+    # An event at each instant predicts the state to it.
+    steps = Events.alike(INPUT, instants, np.full((instants.size, model.width), np.nan))
+    ahead = Log.resume(model, base, steps if inputs is None else Events.concat([steps, inputs], model.width))
+    fold = Fold(estimator, model, tuning, ahead, base=base)
     by_members = fold.estimator.blocks is not None and model.nx <= LARGE
     rows = np.searchsorted(fold.log.events.t, instants, side="right")
     each = fine // times
@@ -159,12 +162,6 @@ def _column(model: StateSpaceModel, name: str) -> int:
         kind = "an angle" if model.shown_states[column].circular else "a mode"
         raise EstimatorError(f"limits: {name} is {kind}, which has no side beyond a limit")
     return column
-
-
-def _future(model: StateSpaceModel, base: Base, instants: np.ndarray, inputs: Events | None) -> Log:
-    """Return a log with an event at each instant, which predicts the state to it, and the events of inputs."""
-    steps = Events.alike(INPUT, instants, np.full((instants.size, model.width), np.nan))
-    return Log.resume(model, base, steps if inputs is None else Events.concat([steps, inputs], model.width))
 
 
 class _Watch:

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
-
 import numpy as np
 
 from ..model.assemble import deviation, outside
@@ -120,12 +118,6 @@ MIN_SHARE = 0.005
 """Share of a variance below which a parameter is not named."""
 
 
-def shares_text(shares: Mapping[str, float]) -> str:
-    """Return the shares of one state's variance as text, the largest first: "capacity 60 %, noise 38 %, r0 2 %"."""
-    named = [(name, share) for name, share in shares.items() if abs(share) >= MIN_SHARE]
-    return ", ".join(f"{name} {100 * share:.0f} %" for name, share in sorted(named, key=lambda item: -item[1]))
-
-
 def source_texts(model: StateSpaceModel, cov: np.ndarray) -> dict[str, tuple[str, str]]:
     """Return for each estimated state the sources of its variance, and the gain of measuring one of them, as text.
 
@@ -136,5 +128,6 @@ def source_texts(model: StateSpaceModel, cov: np.ndarray) -> dict[str, tuple[str
         std = float(np.sqrt(cov[(k := model.state_names.index(name)), k]))
         label, left = next(iter(known[name].items()))
         gain = f"{label}: σ {std:.2g} to {left:.2g}" if left < (1.0 - MIN_SHARE) * std else "no parameter reduces σ"
-        found[name] = shares_text(shares), gain
+        named = sorted(((k, v) for k, v in shares.items() if abs(v) >= MIN_SHARE), key=lambda item: -item[1])
+        found[name] = ", ".join(f"{source} {100 * share:.0f} %" for source, share in named), gain
     return found

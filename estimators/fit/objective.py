@@ -369,7 +369,10 @@ def quasi_newton(
             near = promised < NEAR and scale == 1.0
             found = _along(objective, x, step, [1.0] if near else [scale * share for share in SHARES])
             if near:
-                found += _along(objective, x, step, _more_shares((found[0].value - value) / promised))
+                # Of the promised gain there was too little, or far more: a smaller or a larger share of the step.
+                ratio = (found[0].value - value) / promised
+                more = [s for s in SHARES if (ratio < MIN_SHARE and s < 1.0) or (ratio > MAX_RATIO and s > 1.0)]
+                found += _along(objective, x, step, more)
             best = max(found, key=lambda item: item.value)
             gained = best.value - value
             if gained <= 0.0 and scale == 1.0:
@@ -390,13 +393,6 @@ def quasi_newton(
         if fresh:
             H = _outer(objective, scores)
     return x, value
-
-
-def _more_shares(ratio: float) -> list[float]:
-    """Return the further shares of a step to try, by the ratio of its gain to the promised one."""
-    if ratio < MIN_SHARE:
-        return [share for share in SHARES if share < 1.0]
-    return [share for share in SHARES if share > 1.0] if ratio > MAX_RATIO else []
 
 
 class _Tried(NamedTuple):

@@ -106,7 +106,10 @@ def decide(fold: ReopeningFold, row: int, doubt: np.ndarray, reopen: float) -> t
         text = decision_text(model, name, AGREES, 0, "", nothing, 0.0, reopen, False, np.zeros(0))
         return Decision(index, index, time, name, AGREES, 0, time, np.nan, 0, text), False
     run, begun = int(own[RUN]), own[FROM]
-    start = _first_refused(fold, row, sensor, int(own[SINCE]) - log.first)
+    # The first rejected measurement of the sensor, within reach.
+    begin = max(int(own[SINCE]) - log.first, row - MAX_COMPARED_EVENTS, 0)
+    mine = begin + log.events.select(slice(begin, row + 1)).of_sensor(sensor)
+    start = int(mine[np.isin(fold.track.verdict[mine], (GATED, USED))][0])
     kind, channel = log.kind[start : row + 1], log.channel[start : row + 1]
     first = fold.track.select(slice(start, row + 1))
     most = _most_rejected(first, kind, channel)
@@ -197,13 +200,6 @@ def _exchanged(one: tuple[np.ndarray, ...], other: tuple[np.ndarray, ...]) -> fl
         off = y[:, k] - np.interp(t, at, predicted[:, k])
         nis += off**2 / np.interp(t, at, variance[:, k])
     return float(np.nanmedian(nis))
-
-
-def _first_refused(fold: ReopeningFold, row: int, sensor: int, since: int) -> int:
-    """Return the first rejected measurement of a sensor from row `since` on, within reach before `row`."""
-    log, begin = fold.log, max(since, row - MAX_COMPARED_EVENTS, 0)
-    mine = begin + log.events.select(slice(begin, row + 1)).of_sensor(sensor)
-    return int(mine[np.isin(fold.track.verdict[mine], (GATED, USED))][0])
 
 
 DECISION_NATS = float(np.log(1000.0))
