@@ -25,7 +25,7 @@ from __future__ import annotations
 
 from ..model.rk4 import rk4
 from ..model.state_space import Input, Noise, Parameter, Row, Sensor, State, StateSpaceModel
-from ..numerics.jit import jit
+from ..numerics.jit import jit, named
 
 COPPER = 0.00393  # Temperature coefficient of copper's resistivity at 20 °C, 1/K
 
@@ -109,6 +109,7 @@ def network(u, p):
     )
 
 
+@named
 @jit
 def balance(
     T, copper, iron_tooth, iron_yoke, iron_magnet, wt, ty, tm, wm, yc, wa, ma, cw, ct, cy, cm, coolant, ambient
