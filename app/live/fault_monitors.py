@@ -76,8 +76,10 @@ class RootCause:
         """Return the episode with the most likely fault and, while it lasts, the states not affected, in its text."""
         words = self.fault_behind(episode)
         text = f"{episode.text}; most likely fault: {words}" if words else episode.text
-        # A state may have the name of a sensor, and episodes without alarms.
-        unaffected = self._levels.unaffected.get(episode.subject) if detector_of(episode.cause).alarms else None
+        # A state may have the name of a sensor, and episodes without alarms: of a state that is wrong itself.
+        wrong = {each.subject for each in self._episodes() if not (each.end or detector_of(each.cause).alarms)}
+        known = self._levels.unaffected.get(episode.subject, ()) if detector_of(episode.cause).alarms else ()
+        unaffected = ", ".join(name for name in known if name not in wrong)
         return episode._replace(text=f"{text}; not affected: {unaffected}" if unaffected and not episode.end else text)
 
     def primary(self, episodes: Sequence[Episode]) -> Episode:
@@ -138,7 +140,7 @@ class ProtectionMonitor:
             false_alarm: Mean time between false alarms of the detectors, s.
         """
         self._take, self._false_alarm = take, false_alarm
-        self.unaffected: dict[str, str] = {}
+        self.unaffected: dict[str, list[str]] = {}
         """States that errors of each sensor row do not affect: a lasting one of its σ moves them by less than
         `MIN_MOVED` of theirs."""
         self._latest: ProtectionLevels | None = None
@@ -180,11 +182,11 @@ class ProtectionMonitor:
         except Exception as error:  # noqa: BLE001  a user's model may raise anything; the status shows the reason
             return ProtectionLevels(taken.revision, taken.end, f"{type(error).__name__}: {error}")
         self.unaffected = {
-            fault.nudge.name: ", ".join(
+            fault.nudge.name: [
                 state.name
                 for state, moved, std in zip(model.shown_states, fault.response.states[-1], found.std[-1], strict=True)
                 if state.watched and abs(moved) * fault.nudge.scale < MIN_MOVED * std
-            )
+            ]
             for fault in found.faults
             if fault.nudge.kind == SENSOR
         }

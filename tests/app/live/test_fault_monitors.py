@@ -57,6 +57,9 @@ def test_the_status_shows_the_sensitivity_of_the_same_events():
     told = [engine._watchers.root_cause.with_fault(episode).text for episode in several]
     # A constant offset of the only sensor is one of the temperature, and none of its rate.
     assert told == ["winding has spikes; not affected: rate", "winding has spikes", "winding has spikes"]
+    # The rate is wrong already.
+    engine._watchers.root_cause._episodes = lambda: [lasting._replace(subject="rate", cause="impossible")]
+    assert engine._watchers.root_cause.with_fault(lasting).text == "winding has spikes"
     # Of the one sensor's noise of 2 °C.
     (smallest,) = found.smallest
     size = float(computed.faults[0].visible)
