@@ -1,4 +1,4 @@
-"""Are the corrections of a state larger than they should be over its own memory?
+"""Are the corrections of a state too large over its own memory, and is one that was proved wrong corrected yet?
 
 An error of the model that lasts is taken up by small corrections of one sign, each inside its band, which the tests of
 single innovations cannot tell from chance (`detectors.py`); the estimate stays wrong by what the next corrections will

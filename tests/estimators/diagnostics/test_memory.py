@@ -8,7 +8,7 @@ import pytest
 from estimators.diagnostics.detectors import IMPOSSIBLE_AT, memory_flag
 from estimators.diagnostics.health import HealthPolicy
 from estimators.diagnostics.memory import fresh_memory, level_of, memory_of
-from estimators.diagnostics.references import HALF_WIDTH, own_grades, state_grades, state_health
+from estimators.diagnostics.references import HALF_WIDTH, SUSPICIONS, own_grades, state_grades, state_health
 from estimators.fleet.fleet import Fleet
 from estimators.fold import Fold
 from estimators.log import INPUT, READING, RESET, Log
@@ -42,6 +42,7 @@ CELL = StateSpaceModel(
 )
 QUIET = HealthPolicy(false_alarm_every=1e12)
 VOLTAGE = CELL.sensors[0].rows[0].variance
+F, Q, H = np.diag([1.0, 0.95]), np.diag([1e-8, 1e-4]), np.array([1.0, 0.05])
 
 
 def cell(scale, n, seed=0):
@@ -60,7 +61,6 @@ def cell(scale, n, seed=0):
 
 def by_forecasts(log, first, end):
     """z, rho and variance of both states, from a forecast without measurements `first` to `end` of a dense filter."""
-    F, Q, H = np.diag([1.0, 0.95]), np.diag([1e-8, 1e-4]), np.array([1.0, 0.05])
     u, y = log.value[0 : log.n : 2, 0], log.value[1 : log.n : 2, 0]
     x, P, start = np.array([0.5, 0.0]), np.diag([0.05**2, 0.1**2]), None
     for k in range(end):
@@ -155,7 +155,6 @@ def test_an_impossible_estimate_is_told_until_measurements_have_corrected_it(off
     log = log_of(CELL.width, *rows)
     fold = folded("kf", limited, log, policy=QUIET)
     track, y = fold.track.select(slice(1, None, 2)), log.value[1::2, 0]
-    F, Q, H = np.diag([1.0, 0.95]), np.diag([1e-8, 1e-4]), np.array([1.0, 0.05])
     x, P, start, told = np.array([0.95, 0.0]), np.diag([0.05**2, 0.1**2]), None, []
     for i in range(n):
         if i:
@@ -170,7 +169,8 @@ def test_an_impossible_estimate_is_told_until_measurements_have_corrected_it(off
         told.append(start is not None)
     found = track.flags & memory_flag(0, IMPOSSIBLE_AT) != 0
     np.testing.assert_array_equal(found, told)
-    assert found[0] and found[-1] == (until == n) and track.mean[-1, 0] < 1.0
+    reasons = [text for _, text in own_grades(limited, fold.track, fold.u).values()]
+    assert found[0] and (SUSPICIONS[IMPOSSIBLE_AT] in reasons) == (until == n) and track.mean[-1, 0] < 1.0
 
 
 def test_a_reset_begins_again():
