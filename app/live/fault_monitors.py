@@ -77,7 +77,7 @@ class RootCause:
         words = self.fault_behind(episode)
         text = f"{episode.text}; most likely fault: {words}" if words else episode.text
         # A state may have the name of a sensor, and episodes without alarms: of a state that is wrong itself.
-        wrong = {each.subject for each in self._episodes() if not (each.end or detector_of(each.cause).alarms)}
+        wrong = {each.subject for each in self._episodes() if each.end is None and not detector_of(each.cause).alarms}
         known = self._levels.unaffected.get(episode.subject, ()) if detector_of(episode.cause).alarms else ()
         unaffected = ", ".join(name for name in known if name not in wrong)
         return episode._replace(text=f"{text}; not affected: {unaffected}" if unaffected and not episode.end else text)
