@@ -6,6 +6,7 @@ import ast
 import inspect
 import math
 import re
+import sys
 from typing import Annotated, Any, ClassVar, Literal
 
 from pydantic import (
@@ -95,6 +96,11 @@ def as_choice(value: Any) -> Any:
 Option = Annotated[Number | Annotated[str, Field(min_length=1)], BeforeValidator(as_choice)]
 Flag = Annotated[bool, Field(strict=True)]
 Text = Annotated[str, Field(min_length=1)]
+EnvironmentName = Annotated[str, Field(pattern=r"^[A-Za-z_][A-Za-z0-9_]*$")]
+"""Name of an environment variable: secrets stand in the environment, never in a file."""
+
+Host = Annotated[str, Field(pattern=r"^[^\s/]+$")]
+Port = Annotated[int, Field(strict=True, ge=1, le=65535)]
 
 
 def as_list(value: Any) -> Any:
@@ -152,6 +158,8 @@ class Section(BaseModel):
         schema = handler(core_schema)
         described = handler.resolve_ref_schema(schema)["properties"]
         for section in reversed(cls.__mro__[: cls.__mro__.index(Section)]):
+            if section.__qualname__ not in vars(sys.modules[section.__module__]):
+                continue  # of `create_model`: it has no source, and its fields have descriptions
             body = ast.parse(inspect.getsource(section)).body[0].body  # type: ignore[attr-defined]
             for field, text in zip(body, body[1:]):
                 if isinstance(field, ast.AnnAssign) and isinstance(text, ast.Expr):

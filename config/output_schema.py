@@ -2,18 +2,27 @@
 
 from __future__ import annotations
 
-from typing import Annotated, Any, Literal
+from typing import TYPE_CHECKING, Annotated, Any, Literal, Union
 
-from pydantic import BeforeValidator, Field, model_validator
+from pydantic import BeforeValidator, Field, create_model, model_validator
 
-from .fields import Duration, Number, Positive, Section, Text, Texts, as_seconds, one_of, refused
+from .extensions import parts, schemas
+from .fields import (
+    Duration,
+    EnvironmentName,
+    Host,
+    Number,
+    Port,
+    Positive,
+    Section,
+    Text,
+    Texts,
+    as_seconds,
+    one_of,
+    refused,
+)
 from .source_schema import BrokerSection
 
-EnvironmentName = Annotated[str, Field(pattern=r"^[A-Za-z_][A-Za-z0-9_]*$")]
-"""Name of an environment variable: secrets stand in the environment, never in a file."""
-
-Host = Annotated[str, Field(pattern=r"^[^\s/]+$")]
-Port = Annotated[int, Field(strict=True, ge=1, le=65535)]
 Url = Annotated[str, Field(pattern=r"^(https?://\S+|\$[A-Za-z_][A-Za-z0-9_]*)$")]
 
 DelayOrNone = Annotated[
@@ -80,9 +89,11 @@ class MqttReceiverSection(Section):
     """mqtt"""
 
 
-ReceiverSection = Annotated[
-    WebhookSection | EmailSection | CommandSection | MqttReceiverSection, Field(discriminator="type")
-]
+CoreReceiver = WebhookSection | EmailSection | CommandSection | MqttReceiverSection
+if TYPE_CHECKING:
+    ReceiverSection = CoreReceiver
+else:
+    ReceiverSection = Annotated[Union[CoreReceiver, *schemas("receivers").values()], Field(discriminator="type")]
 
 
 class AlertSection(Section):
@@ -185,8 +196,8 @@ class CanOutputSection(Section):
     """DBC file that is written when the twin starts, beside this YAML."""
 
 
-class OutputsSection(Section):
-    """Where the estimate is published, and who receives alerts. Nothing is published by default."""
+class PublishedSection(Section):
+    """How often the state is published, and what of it."""
 
     every: DelayOrNone = 0.1
     """Seconds between two states that are published; 0 publishes after each batch of measurements. Default: 0.1."""
@@ -198,5 +209,23 @@ class OutputsSection(Section):
     """OPC UA server with the states as variables: {host, port, ...}. Default: none."""
     can: CanOutputSection | None = None
     """CAN bus on which the estimate is a virtual sensor: {interface, channel, id, dbc, ...}. Default: none."""
+
+
+if TYPE_CHECKING:
+    Outputs = PublishedSection
+else:
+    Outputs = create_model(
+        "WithExtensions",
+        __base__=PublishedSection,
+        **{
+            key: (schema | None, Field(None, description=parts("outputs")[key][1].text))
+            for key, schema in schemas("outputs").items()
+        },
+    )
+
+
+class OutputsSection(Outputs):
+    """Where the estimate is published, and who receives alerts. Nothing is published by default."""
+
     receivers: dict[Text, ReceiverSection] = {}
     """Receivers of alerts, by name. Default: none."""

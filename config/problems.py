@@ -11,6 +11,7 @@ from pydantic_core import ErrorDetails
 
 from estimators.errors import ConfigError, nearest
 
+from .extensions import left_out
 from .source_schema import PartSection, SourceSection
 from .yaml_files import Key, ValuePlaces, dotted, parse, shown_path
 
@@ -85,7 +86,8 @@ def _line(problem: ErrorDetails, key: Key, value: Any, places: ValuePlaces) -> s
         return f"{places.at(key)}: {dotted((*key, name))} is missing; add it"
     if kind == "unknown_key":
         stray = (*key, context["key"])
-        return f"{places.at(stray)}: {dotted(stray)} is not known; {nearest(context['key'], context['known'])}"
+        rule = nearest(context["key"], context["known"]) + left_out()
+        return f"{places.at(stray)}: {dotted(stray)} is not known; {rule}"
     if kind == "relation":
         key = (*key, context["key"])
         return f"{places.at(key)}: {dotted(key)} {problem['msg']}"
@@ -97,7 +99,7 @@ def _line(problem: ErrorDetails, key: Key, value: Any, places: ValuePlaces) -> s
         return f"{places.at(key)}: {dotted((*key, 'type'))} is missing; {_choices(problem)}"
     if kind == "union_tag_invalid":
         key, value = (*key, "type"), context["tag"]
-        rule = nearest(value, [item.strip("'") for item in context["expected_tags"].split(", ")])
+        rule = nearest(value, [item.strip("'") for item in context["expected_tags"].split(", ")]) + left_out()
     else:
         rule = _rule(kind, context, problem["msg"], value)
     return f"{places.at(key)}: {dotted(key)} is {shown(value)}; {rule}"

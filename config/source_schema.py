@@ -2,24 +2,21 @@
 
 from __future__ import annotations
 
-from abc import abstractmethod
 from datetime import date
-from typing import Annotated, Any, Literal
+from typing import TYPE_CHECKING, Annotated, Any, Literal, Union
 from zoneinfo import ZoneInfo, ZoneInfoNotFoundError, available_timezones
 
 from pydantic import AfterValidator, BeforeValidator, Field, model_validator
 
 from estimators.errors import nearest
 
+from .channels import ColumnSection, SignalSection
+from .extensions import schemas
 from .fields import (
     MAX_DURATION_S,
-    Condition,
     Count,
     LevelSection,
     Number,
-    Numbers,
-    Positives,
-    Repeats,
     Seconds,
     Section,
     SomeSeconds,
@@ -31,122 +28,6 @@ from .fields import (
     one_of,
     refused,
 )
-
-
-class AccuracySection(Section):
-    """Noise that the source reports with each measurement, as a GNSS receiver does. Give one of the two.
-
-    It replaces the tuned R for that measurement. If it is missing or not positive, R is used.
-    """
-
-    std: Texts | None = None
-    """Name of the signal of the same message, or of the column, that holds the standard deviation; a list names one for
-    each row of the sensor."""
-    variance: Texts | None = None
-    """The same of the variance."""
-    units: Texts | None = None
-    """Unit of each, converted to the row's, or to its square for a variance (cm, m^2, ...). Default: the DBC's, else
-    the model's."""
-    scale: Positives = (1.0,)
-    """Factor applied after the conversion of units: 0.5 if two standard deviations are reported. Default: 1."""
-
-    @property
-    def names(self) -> tuple[str, ...]:
-        """The signals or columns, one for all rows or one a row."""
-        return self.std or self.variance or ()
-
-    @model_validator(mode="after")
-    def _one(self) -> AccuracySection:
-        one_of(self, "std", "variance", required=True)
-        return self
-
-
-class ChannelSection(Section):
-    """How the values of one sensor, input or state are taken from the source: value·scale + offset, in model units."""
-
-    units: Texts | None = None
-    """Unit of each value, converted to the model's (km/h, degC, deg/s, ...). Default: the DBC's, else the model's."""
-    scale: Numbers = (1.0,)
-    """Factor applied after the unit is converted; -1 turns an axis round. A list gives one a value. Default: 1."""
-    offset: Numbers = (0.0,)
-    """Added after `scale`, in the model's unit. A list gives one a value. Default: 0."""
-    where: dict[str, Condition] = {}
-    """Conditions {name: value} or {name: {min, max}} on other values of the same row or message; where one fails, the
-    measurement is missing. Of a table also texts: {quality: Good} or {quality: [Good, Uncertain]}. Default: none."""
-    only: dict[str, Condition] = {}
-    """Conditions as in `where` that select the rows or frames of this channel: {anchor: 3}, {tag: TT101}. Others are
-    ignored, without a missing measurement. Default: none."""
-    by: Text | dict[Text, dict[Text, Condition]] | None = None
-    """Column or signal with the landmark of each row, for a sensor with landmarks: landmark_id. If its values are not
-    the ids of the sensors SENSOR_ID, also the value of each id: {node_id: {1: 0, 2: 1, 3: 5}}. Rows with other values
-    are ignored. Default: none."""
-    convert: Literal["east_north"] | None = None
-    """east_north: the two values are latitude and longitude in degrees, and become metres east and north of `origin`.
-    Default: null, no conversion."""
-    origin: tuple[Number, Number] | None = None
-    """Latitude and longitude of the local origin, degrees. Default: the first valid fix."""
-    repeats: Repeats = "keep"
-    """Rows of a sensor that repeat its value: keep takes each for a measurement; changes leaves out those whose value
-    equals the one before; `every 10 s` too, but for one every 10 s while the value stays, if the source repeats a
-    value for so long. `nisus log` finds it. Default: keep."""
-    accuracy: AccuracySection | None = None
-    """Noise that is reported with each measurement of a sensor, {std: SIGNAL}. Default: null, the tuned R."""
-
-    @abstractmethod
-    def names(self) -> tuple[str, ...]:
-        """Return the signals or columns, one a row."""
-
-    @model_validator(mode="after")
-    def _lengths(self) -> ChannelSection:
-        count = len(self.names())
-        for key in ("units", "scale", "offset"):
-            values = getattr(self, key)
-            if values is not None and len(values) not in (1, count):
-                text = f"has {len(values)} entries; give one, or one for each of the {count} values"
-                raise refused("relation", text, key)
-        own = self.accuracy
-        for word, entries in (("names", own.names), ("units has", own.units), ("scale has", own.scale)) if own else ():
-            if entries is not None and len(entries) not in (1, count):
-                text = f"{word} {len(entries)}; give one, or one for each of the {count} values"
-                raise refused("relation", text, "accuracy")
-        if self.convert == "east_north" and count != 2:
-            text = f"is east_north; it needs two values, latitude and longitude, and {count} are named"
-            raise refused("relation", text, "convert")
-        return self
-
-
-class SignalSection(ChannelSection):
-    """Values from the signals of one CAN message."""
-
-    message: Text
-    """The message's name in the DBC."""
-    signals: Texts
-    """Its signal's name, or a list: one for each row of the sensor. For a sensor with landmarks * is the id."""
-
-    @model_validator(mode="after")
-    def _numbers(self) -> SignalSection:
-        for key in ("where", "only"):
-            for name, rule in getattr(self, key).items():
-                if rule.text is not None:
-                    text = f"compares {name} with the text {rule.text[0]!r}; give the signal's raw number"
-                    raise refused("relation", text, key)
-        return self
-
-    def names(self) -> tuple[str, ...]:
-        """Return the signals, one a row."""
-        return self.signals
-
-
-class ColumnSection(ChannelSection):
-    """Values from the columns of a table."""
-
-    columns: Texts
-    """The column's name, or a list: one for each row of the sensor. For a sensor with landmarks TT* names a column of
-    each: TT followed by its id."""
-
-    def names(self) -> tuple[str, ...]:
-        """Return the columns, one a row."""
-        return self.columns
 
 
 class DatabaseSection(Section):
@@ -556,7 +437,7 @@ class MergedSection(Section):
         return self
 
 
-SourceSection = Annotated[
+CoreSource = (
     SimulatorSection
     | CanSection
     | CanLogSection
@@ -565,9 +446,12 @@ SourceSection = Annotated[
     | PushSection
     | MqttSourceSection
     | OpcUaSourceSection
-    | ModbusSourceSection,
-    Field(discriminator="type"),
-]
+    | ModbusSourceSection
+)
+if TYPE_CHECKING:
+    SourceSection = CoreSource
+else:
+    SourceSection = Annotated[Union[CoreSource, *schemas("sources").values()], Field(discriminator="type")]
 
 
 class FaultSection(Section):

@@ -307,25 +307,6 @@ class WhyCommand(JsonOption, FoldOptions):
 
 
 @dataclass(frozen=True)
-class ExportCommand(JsonOption, FoldOptions):
-    """Write the filter of a twin as C99 for a controller, with a test on the twin's own log.
-
-    kf, kf-steady and ekf of models of up to 32 states, without allocation. The test compares the C code with the fold.
-
-    Examples:
-      nisus export motor_winding --c
-      nisus export motor_can --c --out firmware --duration 60
-    """
-
-    c: Flag = False
-    """Write NAME.h, NAME.c, NAME_test.c and NAME_vectors.csv."""
-    out: Path = field(default_factory=Path.cwd)
-    """Folder to write to; it is created if needed."""
-    events: int = 2000
-    """Largest number of measurements and inputs in the test."""
-
-
-@dataclass(frozen=True)
 class CheckCommand(JsonOption, ClusterOption, FoldOptions):
     """Print a checklist of what could be wrong with a twin without being detected.
 
@@ -729,7 +710,6 @@ COMMANDS: dict[type, str] = {
     FleetCommand: "fleet:run_fleet",
     FoldCommand: "fold:fold_twin",
     WhyCommand: "why:explain_change",
-    ExportCommand: "export:export_filter",
     CheckCommand: "check:check_twin",
     AdviseCommand: "advise:advise",
     CompareCommand: "compare:compare_twin",

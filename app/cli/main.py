@@ -20,6 +20,7 @@ from typing import Annotated, Any
 
 import tyro
 
+from config.extensions import left_out, maker, schemas
 from config.yaml_files import shown_path
 from estimators.errors import ConfigError, NisusError, nearest, shown_name
 
@@ -40,6 +41,9 @@ FULL = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG, errno.EIO)  # errors of a devic
 
 def carry_out(command: Any) -> int:
     """Run one command; only its own module is imported, so that `nisus twins` answers at once."""
+    if type(command) not in COMMANDS:
+        name = next(name for name, options in schemas("commands").items() if options is type(command))
+        return int(maker("commands", name)(command))
     module, _, function = COMMANDS[type(command)].partition(":")
     workers: tuple[Any, ...] = ()
     if isinstance(command, RunCommand) and command.twin is not None and not command.headless:
@@ -68,8 +72,9 @@ def parse(arguments: Sequence[str]) -> Any:
         ConfigError: If the command or an option does not exist, or a value must be a number and is not.
     """
     name = arguments[0] if arguments else "--help"
-    if name in NAMES:
-        command = NAMES[name]
+    commands = NAMES if name in NAMES else NAMES | schemas("commands")
+    if name in commands:
+        command = commands[name]
         given = [*arguments[1:]]
         if command in (RunCommand, ServeCommand):
             given += environment_options(name, command, given, os.environ)
@@ -77,11 +82,11 @@ def parse(arguments: Sequence[str]) -> Any:
         return tyro.cli(command, args=given, prog=f"nisus {name}", description=described(command))
     if name not in ("-h", "--help", COMPLETION):
         kind = "option" if name.startswith("-") else "command"
-        names = ["--help", "--version", COMPLETION] if name.startswith("-") else list(NAMES)
-        raise ConfigError(f"{shown_name(name)}: there is no such {kind}; {nearest(name, names)}")
+        names = ["--help", "--version", COMPLETION] if name.startswith("-") else list(commands)
+        raise ConfigError(f"{shown_name(name)}: there is no such {kind}; {nearest(name, names)}{left_out()}")
     named: list[Any] = [
         Annotated[command, tyro.conf.subcommand(name, description=described(command).split("\n")[0])]
-        for name, command in NAMES.items()
+        for name, command in commands.items()
     ]
     show = functools.partial(tyro.cli, functools.reduce(operator.or_, named), prog="nisus", description=HEAD)
     if name != COMPLETION:

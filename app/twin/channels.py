@@ -6,9 +6,10 @@ from collections.abc import Mapping, Sequence
 from math import inf
 from typing import TYPE_CHECKING, Any
 
+from config.channels import ChannelSection, SignalSection
 from config.fields import ConditionSection, repeat_period
 from config.loader import Loaded
-from config.source_schema import ChannelSection, FaultSection, SignalSection
+from config.source_schema import FaultSection
 from config.yaml_files import Key
 from estimators.log import INPUT, READING, TRUTH
 from estimators.model.state_space import Field, StateSpaceModel

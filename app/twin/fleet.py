@@ -23,7 +23,7 @@ from sources.tables.text import column_of
 from .channels import channels
 from .checks import check_receivers
 from .fleet_tunings import AssetValues, asset_values
-from .source import KEY, SOURCES, Plan, plan_source
+from .source import KEY, Plan, kind_of, plan_source
 from .sources.kind import Opening, matching
 from .twin import Twin, load_twin
 
@@ -91,11 +91,11 @@ class FleetPlan:
             SourceError: If it cannot be opened, with the remedy.
         """
         opening = self._opening(report)
-        return SOURCES[self.config.source.type].open(replace(opening, stored=stored))
+        return kind_of(self.config.source.type).open(replace(opening, stored=stored))
 
     def check_files(self) -> None:
         """Open the files of the source, and close them; raises as `open`."""
-        SOURCES[self.config.source.type].files(self._opening(lambda *_: None))
+        kind_of(self.config.source.type).files(self._opening(lambda *_: None))
 
     def _opening(self, report: Report) -> Opening:
         given = self.config.assets

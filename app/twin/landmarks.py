@@ -6,10 +6,10 @@ from collections.abc import Mapping
 from dataclasses import replace
 from typing import Any
 
+from config.channels import ChannelSection, SignalSection
 from config.fields import ConditionSection
 from config.loader import Loaded
 from config.schema import SensorSection
-from config.source_schema import ChannelSection, SignalSection
 from config.yaml_files import Key
 from estimators.errors import ModelError
 from estimators.model.landmarks import missing, with_landmarks

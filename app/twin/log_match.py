@@ -15,7 +15,7 @@ from estimators.model.state_space import StateSpaceModel
 from sources.formats import CAN_LOGS
 
 from .channels import channels
-from .source import KEY, SOURCES
+from .source import KEY, kind_of
 from .sources.kind import find_databases
 
 if TYPE_CHECKING:
@@ -66,7 +66,7 @@ class TwinMatch:
 def match_log(loaded: Loaded, model: StateSpaceModel, header: LogHeader) -> TwinMatch:
     """Return how far the channels of a twin are in a log; nothing is read but the twin's databases."""
     section = loaded.config.source
-    kind = SOURCES[section.type]
+    kind = kind_of(section.type)
     if not kind.takes_log:
         return TwinMatch(blocking=f"its source is a {section.type}, which reads no log")
     parts = kind.sections(section, KEY)

@@ -4,12 +4,13 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from functools import cached_property, partial
+from functools import cache, cached_property, partial
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 import numpy as np
 
+from config.extensions import maker
 from config.loader import Loaded
 from config.source_schema import AssetSection, CanLogSection, CanSection, RecordingSection, TableSection
 from config.yaml_files import Key
@@ -22,7 +23,7 @@ from .defaults import rhythm
 from .sources.asset import SIMULATOR
 from .sources.can import CAN, CAN_LOG, make_player
 from .sources.kind import Kind, Opening, find_databases, find_recording
-from .sources.push import MODBUS, MQTT, OPC_UA, PUSH
+from .sources.push import MODBUS, MQTT, OPC_UA, PUSH, of_messages
 from .sources.recordings import MERGED, TABLE
 
 if TYPE_CHECKING:
@@ -54,27 +55,27 @@ class Plan:
     @property
     def kernels(self) -> tuple[str, ...]:
         """Compiled functions of the source; see `sources/pieces.py`."""
-        return SOURCES[self.loaded.config.source.type].kernels
+        return kind_of(self.loaded.config.source.type).kernels
 
     @property
     def recorded(self) -> bool:
         """Whether it is read from files, and so is neither a bus nor a simulation."""
         section = self.loaded.config.source
         live = section.type == "can" or (isinstance(section, TableSection) and section.follow)
-        return SOURCES[section.type].takes_log and (not live or self.log_files is not None)
+        return kind_of(section.type).takes_log and (not live or self.log_files is not None)
 
     @cached_property
     def period(self) -> float | None:
         """The longest `rhythm` of the sensors of a recording, s, without those by chance unless all are; or None."""
         section, sensors, slowest = self.loaded.config.source, self.model.sensors, None
         steady = [k for k in self.fed if not sensors[k].by_chance] or self.fed
-        parts = SOURCES[section.type].sections(section, KEY) if self.recorded else {}
+        parts = kind_of(section.type).sections(section, KEY) if self.recorded else {}
         if len(parts) > 1 and self.log_files is not None:
             return None
         for key, part in parts.items():
             opening = Opening(self.loaded, self.model, part, key, lambda *_: None, False, self.log_files)
             try:
-                source = SOURCES[part.type].open(opening)
+                source = kind_of(part.type).open(opening)
             except SourceError:
                 return None  # reported when the source is opened to be read
             most, batches = 1, iter(partial(source.read, FIRST_EVENTS_S), None)
@@ -103,7 +104,7 @@ class Plan:
         """
         section = self.loaded.config.source
         opening = Opening(self.loaded, self.model, section, KEY, lambda *_: None, log_files=self.log_files)
-        SOURCES[section.type].files(opening)
+        kind_of(section.type).files(opening)
 
     def faults(self) -> Faults:
         """Return a new layer of faults, with those of the YAML."""
@@ -134,7 +135,7 @@ class Plan:
         opening = Opening(self.loaded, self.model, section, KEY, report, live=live, log_files=self.log_files)
 
         def bare() -> Source:
-            source = SOURCES[section.type].open(opening)
+            source = kind_of(section.type).open(opening)
             try:
                 layer.attach(source)
             except SourceError:
@@ -167,7 +168,7 @@ def plan_source(loaded: Loaded, model: StateSpaceModel, log_files: Sequence[Path
         SourceError: If the source reads no recording and one was given.
     """
     section = loaded.config.source
-    kind = SOURCES[section.type]
+    kind = kind_of(section.type)
     if log_files is not None and not kind.takes_log:
         others = [name for name, other in SOURCES.items() if other.takes_log]
         raise SourceError(
@@ -207,7 +208,7 @@ def missing(loaded: Loaded) -> str | None:
     """Return a missing recording or DBC file, in one line with the remedy; None if all are present."""
     section = loaded.config.source
     try:
-        for key, part in SOURCES[section.type].sections(section, KEY).items():
+        for key, part in kind_of(section.type).sections(section, KEY).items():
             if isinstance(part, RecordingSection) and not (isinstance(part, TableSection) and part.follow):
                 find_recording(loaded, part, key, None)
             if isinstance(part, CanSection | CanLogSection):
@@ -228,4 +229,10 @@ SOURCES: dict[str, Kind] = {
     "opcua": OPC_UA,
     "modbus": MODBUS,
 }
-"""By the `type` of the section."""
+"""Those of the core, by the `type` of the section."""
+
+
+@cache
+def kind_of(name: str) -> Kind:
+    """Return the kind of a source by the `type` of its section; those of extensions are imported on first use."""
+    return SOURCES[name] if name in SOURCES else of_messages(maker("sources", name))

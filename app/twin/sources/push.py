@@ -3,12 +3,13 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Iterable
+from collections.abc import Callable, Iterable
 from dataclasses import replace
 from typing import TYPE_CHECKING, Any
 
+from config.channels import ColumnSection
 from config.fleet_schema import ASSET_LEVEL, FleetMqttSection, FleetPushSection
-from config.source_schema import ColumnSection, ModbusSourceSection, MqttSourceSection, OpcUaSourceSection, PushSection
+from config.source_schema import ModbusSourceSection, MqttSourceSection, OpcUaSourceSection, PushSection
 from config.yaml_files import Key
 from estimators.errors import nearest, shown_name
 from estimators.model.state_space import StateSpaceModel
@@ -30,7 +31,7 @@ MAX_REGISTERS = 65_536
 MessageSection = PushSection | MqttSourceSection | OpcUaSourceSection | ModbusSourceSection
 
 
-def _messages(opening: Opening, key: str = "", named: Iterable[str] = ()) -> Messages:
+def messages_of(opening: Opening, key: str = "", named: Iterable[str] = ()) -> Messages:
     """Return the values of a source; refuse those `named` under `key` that feed nothing."""
     from sources.messages import Messages
 
@@ -53,7 +54,7 @@ def _open_mqtt(opening: Opening) -> Source:
     from sources.brokers import SHARED, MqttSource, TopicMap
 
     section: MqttSourceSection = opening.section
-    messages = _messages(opening, "topics", (name for topic in section.topics.values() for name in topic.values))
+    messages = messages_of(opening, "topics", (name for topic in section.topics.values() for name in topic.values))
     topics: dict[str, TopicMap] = {}
     subscribed: list[str] = []
     by_hand = opening.stored and section.client_id is not None and section.qos > 0
@@ -105,7 +106,7 @@ def _open_opcua(opening: Opening) -> Source:
     from sources.brokers import OpcUaSource
 
     section: OpcUaSourceSection = opening.section
-    messages = _messages(opening, "nodes", section.nodes)
+    messages = messages_of(opening, "nodes", section.nodes)
     return OpcUaSource(messages, section.url, section.nodes, period=section.every, report=opening.report)
 
 
@@ -113,7 +114,7 @@ def _open_modbus(opening: Opening) -> Source:
     from sources.modbus import ModbusSource, Register
 
     section: ModbusSourceSection = opening.section
-    messages = _messages(opening, "registers", section.registers)
+    messages = messages_of(opening, "registers", section.registers)
     registers = {name: Register(**item.model_dump()) for name, item in section.registers.items()}
     for name, item in registers.items():
         last = MAX_REGISTERS - item.size
@@ -148,7 +149,12 @@ def _sections(section: MessageSection, key: Key) -> dict[Key, Any]:
     return {key: section} if section.sensors or section.inputs or section.truth else {}
 
 
-PUSH = Kind(_messages, sections=_sections, takes_log=False, kernels=(VALUES,))
-MQTT = Kind(_open_mqtt, sections=_sections, takes_log=False, kernels=(VALUES,), files=_check_secrets)
-OPC_UA = Kind(_open_opcua, sections=_sections, takes_log=False, kernels=(VALUES,))
-MODBUS = Kind(_open_modbus, sections=_sections, takes_log=False, kernels=(VALUES,))
+def of_messages(open_: Callable[[Opening], Source], files: Callable[[Opening], object] = lambda _: None) -> Kind:
+    """Return the kind of a live source of messages, which has no recording."""
+    return Kind(open_, sections=_sections, takes_log=False, kernels=(VALUES,), files=files)
+
+
+PUSH = of_messages(messages_of)
+MQTT = of_messages(_open_mqtt, files=_check_secrets)
+OPC_UA = of_messages(_open_opcua)
+MODBUS = of_messages(_open_modbus)

@@ -19,7 +19,7 @@ from ...live.jobs import CANCELLED, CANCELLING, DONE, FAILED, RUNNING, Job
 from ...studies.advice.draft import check_new
 from ...studies.log_overview import DraftStep, LogOverview, draft, overview
 from ...twin.log_match import LogHeader, TwinMatch, match_log
-from ...twin.source import KEY, SOURCES
+from ...twin.source import KEY, kind_of
 from ...twin.sources.kind import find_databases
 from ..running import stamp_of
 from .cards import Card, readable_twins
@@ -272,7 +272,7 @@ class DroppedLogs:
             found = {path: [] for path in inside if path.is_file() and not path.is_symlink() and path.name[0] != "."}
         for card, loaded, _ in readable_twins(self._names()):
             section = loaded.config.source
-            for key, part in SOURCES[section.type].sections(section, KEY).items():
+            for key, part in kind_of(section.type).sections(section, KEY).items():
                 if isinstance(part, CanSection | CanLogSection):
                     with suppress(SourceError):  # its recording is not on this machine
                         for path, _ in find_databases(loaded, part, key):

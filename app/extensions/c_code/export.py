@@ -4,12 +4,12 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING
 
+from app.cli.prepare import attend, prepared
+from app.present.result import to_json
+from app.twin.log_reader import read_log
 from estimators.errors import ConfigError
 
-from ..present.result import to_json
-from ..studies.c_code.filter import export_c
-from ..twin.log_reader import read_log
-from .prepare import attend, prepared
+from .filter import export_c
 
 if TYPE_CHECKING:
     from .arguments import ExportCommand as Arguments

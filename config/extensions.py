@@ -1,0 +1,143 @@
+"""Extensions: optional parts of Nisus, which packages register as entry points of the group `nisus.extensions`.
+
+    [project.entry-points."nisus.extensions"]
+    serial = "nisus_serial:EXTENSION"
+
+Entry points are read once, when a command or the schema first asks for them. The schema of a twin is made of the
+sections of all extensions: their modules import `config.fields` and `config.channels`, and nothing else of Nisus.
+"""
+
+from __future__ import annotations
+
+import logging
+import multiprocessing
+import pkgutil
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, field
+from functools import cache
+from importlib.metadata import entry_points
+from typing import Any, Literal, NamedTuple, TypeVar, get_args
+
+from estimators.errors import ConfigError, printable, reason_of
+
+from .fields import Section
+
+GROUP = "nisus.extensions"
+T = TypeVar("T")
+
+
+class Part(NamedTuple):
+    """One thing that an extension adds. Both are references, `module:name`, which are imported when they are needed.
+
+    `schema` is the class of what a user gives: a dataclass of options, or a `Section` of the YAML. `make` is called
+    with it, and with what `Extension` says. `text` describes a key in the schema of the YAML.
+    """
+
+    schema: str
+    make: str
+    text: str = ""
+
+
+@dataclass(frozen=True)
+class Extension:
+    """What a package adds. Parts are registered by name; that of the extension is the one of its entry point."""
+
+    needs: tuple[str, ...] = ()
+    """Names of the extensions whose modules it imports."""
+    commands: Mapping[str, Part] = field(default_factory=dict)
+    """By the word after `nisus`. `make(options)` runs the command and returns the exit status."""
+    sources: Mapping[str, Part] = field(default_factory=dict)
+    """Live sources of messages, by `source.type`. `make(opening)` opens one (`app.twin.sources.kind.Opening`)."""
+    outputs: Mapping[str, Part] = field(default_factory=dict)
+    """By key under `outputs`. `make(section, engine, secrets)` returns an `app.outputs.Output`."""
+    receivers: Mapping[str, Part] = field(default_factory=dict)
+    """Receivers of alerts, by `type`. `make(section, folder, secrets)` returns an `app.outputs.receivers.Receiver`."""
+
+
+Kind = Literal["commands", "sources", "outputs", "receivers"]
+TAGGED = ("sources", "receivers")
+"""Kinds of which a section is recognised by its `type`, a literal that is the name of the part."""
+
+_left_out: dict[str, str] = {}
+
+
+def left_out() -> str:
+    """Return the end of an error about an unknown name: the extensions that cannot be loaded."""
+    why = "; ".join(f"{name} ({reason})" for name, reason in _left_out.items())
+    return f"; extensions that cannot be loaded: {why}" if why else ""
+
+
+@cache
+def extensions() -> dict[str, Extension]:
+    """Return the installed extensions, by name. One that cannot be loaded is reported in a line, and left out."""
+    points = sorted(entry_points(group=GROUP), key=lambda point: point.name)
+    found = {point.name: item for point in points if (item := _tried(point.name, point.load)) is not None}
+    for name, item in list(found.items()):
+        if not isinstance(item, Extension):
+            _leave_out(found, name, "its entry point names no Extension")
+    while lacking := {name: need for name, item in found.items() for need in item.needs if need not in found}:
+        for name, need in lacking.items():
+            _leave_out(found, name, f"it needs the extension {need}")
+    return found
+
+
+@cache
+def parts(kind: Kind) -> dict[str, tuple[str, Part]]:
+    """Return the parts of a kind by name, each with the name of its extension, which comes first if two have one."""
+    found: dict[str, tuple[str, Part]] = {}
+    for name, item in extensions().items():
+        found = {key: (name, part) for key, part in getattr(item, kind).items()} | found
+    return found
+
+
+@cache
+def schemas(kind: Kind) -> dict[str, Any]:
+    """Return the classes of options or sections of a kind by name, without those that cannot be imported or used."""
+    found = {}
+    for key, (name, part) in parts(kind).items():
+        schema = _tried(name, lambda part=part, key=key: _usable(pkgutil.resolve_name(part.schema), kind, key))
+        if schema is not None:
+            found[key] = schema
+    return found
+
+
+def _usable(schema: Any, kind: Kind, key: str) -> Any:
+    """Return a class of options or sections; one that would stop every twin is refused."""
+    if kind != "commands":
+        if not issubclass(schema, Section):
+            raise TypeError(f"{schema.__name__} is no config.fields.Section")
+        schema.model_rebuild()
+        if kind in TAGGED and get_args(schema.model_fields["type"].annotation) != (key,):
+            raise TypeError(f"type of {schema.__name__} is not Literal[{key!r}]")
+    return schema
+
+
+def maker(kind: Kind, key: str) -> Callable[..., Any]:
+    """Return the function of a part.
+
+    Raises:
+        ConfigError: If it cannot be imported.
+    """
+    name, part = parts(kind)[key]
+    try:
+        return pkgutil.resolve_name(part.make)
+    except Exception as error:  # noqa: BLE001  the module may be of a third party
+        raise ConfigError(f"extension {name}: {_gist(error)}; install its package again") from None
+
+
+def _tried(name: str, work: Callable[[], T]) -> T | None:
+    try:
+        return work()
+    except (Exception, SystemExit) as error:  # noqa: BLE001  no extension may stop a twin that does not need it
+        _leave_out({}, name, _gist(error))
+        return None
+
+
+def _gist(error: BaseException) -> str:
+    return printable(reason_of(error).splitlines()[0])
+
+
+def _leave_out(found: dict[str, Any], name: str, why: str) -> None:
+    found.pop(name, None)
+    if _left_out.setdefault(name, why) == why and multiprocessing.parent_process() is None:
+        logging.getLogger("nisus").warning("extension %s is left out: %s", name, why)
