@@ -14,7 +14,7 @@ import multiprocessing
 import pkgutil
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
-from functools import cache
+from functools import cache, partial
 from importlib.metadata import entry_points
 from typing import Any, Literal, NamedTuple, TypeVar, get_args
 
@@ -95,14 +95,15 @@ def schemas(kind: Kind) -> dict[str, Any]:
     """Return the classes of options or sections of a kind by name, without those that cannot be imported or used."""
     found = {}
     for key, (name, part) in parts(kind).items():
-        schema = _tried(name, lambda part=part, key=key: _usable(pkgutil.resolve_name(part.schema), kind, key))
+        schema = _tried(name, partial(_usable, part.schema, kind, key))
         if schema is not None:
             found[key] = schema
     return found
 
 
-def _usable(schema: Any, kind: Kind, key: str) -> Any:
+def _usable(reference: str, kind: Kind, key: str) -> Any:
     """Return a class of options or sections; one that would stop every twin is refused."""
+    schema = pkgutil.resolve_name(reference)
     if kind != "commands":
         if not issubclass(schema, Section):
             raise TypeError(f"{schema.__name__} is no config.fields.Section")
