@@ -10,13 +10,15 @@ from pathlib import Path
 
 import pytest
 
-from app.cli.arguments import COMMANDS, NAMES
+from app.cli import arguments
 from app.cli.main import described, main, parse
+from config.extensions import maker, schemas
 from config.loader import shipped
 from tests import ROOT
 from tests.cases import cases
 from tests.support import run_python
 
+NAMES = arguments.NAMES | schemas("commands")
 FULL = Path("/dev/full")
 needs_full = pytest.mark.skipif(not FULL.exists(), reason="there is no /dev/full")
 
@@ -29,8 +31,11 @@ def test_twins_are_listed_without_numba():
 def test_every_command_has_a_module_and_a_function(name):
     import importlib
 
-    module, _, function = COMMANDS[NAMES[name]].partition(":")
-    assert callable(getattr(importlib.import_module(f"app.cli.{module}"), function))
+    if name in arguments.NAMES:
+        module, _, function = arguments.COMMANDS[NAMES[name]].partition(":")
+        assert callable(getattr(importlib.import_module(f"app.cli.{module}"), function))
+    else:
+        assert callable(maker("commands", name))
 
 
 @needs_full

@@ -5,9 +5,9 @@ import subprocess
 
 import numpy as np
 import pytest
-from app.studies.c_code.filter import export_c
 
 from app.cli.main import main
+from app.extensions.c_code.filter import export_c
 from app.twin.log_reader import read_log
 from app.twin.twin import load_twin
 from estimators.errors import ConfigError

@@ -4,8 +4,8 @@ import math
 
 import numpy as np
 import pytest
-from app.studies.c_code.terms import FUNCTIONS, Reader, Statements, Term
 
+from app.extensions.c_code.terms import FUNCTIONS, Reader, Statements, Term
 from estimators.errors import ModelError
 from estimators.numerics.jit import jit
 from tests.support import error_of
