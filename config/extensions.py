@@ -82,7 +82,7 @@ def extensions() -> dict[str, Extension]:
 
 
 @cache
-def parts(kind: Kind) -> dict[str, tuple[str, Part]]:
+def registered(kind: Kind) -> dict[str, tuple[str, Part]]:
     """Return the parts of a kind by name, each with the name of its extension, which comes first if two have one."""
     found: dict[str, tuple[str, Part]] = {}
     for name, item in extensions().items():
@@ -94,7 +94,7 @@ def parts(kind: Kind) -> dict[str, tuple[str, Part]]:
 def schemas(kind: Kind) -> dict[str, Any]:
     """Return the classes of options or sections of a kind by name, without those that cannot be imported or used."""
     found = {}
-    for key, (name, part) in parts(kind).items():
+    for key, (name, part) in registered(kind).items():
         schema = _tried(name, partial(_usable, part.schema, kind, key))
         if schema is not None:
             found[key] = schema
@@ -119,7 +119,7 @@ def maker(kind: Kind, key: str) -> Callable[..., Any]:
     Raises:
         ConfigError: If it cannot be imported.
     """
-    name, part = parts(kind)[key]
+    name, part = registered(kind)[key]
     try:
         return pkgutil.resolve_name(part.make)
     except Exception as error:  # noqa: BLE001  the module may be of a third party

@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal, Union
 
 from pydantic import BeforeValidator, Field, create_model, model_validator
 
-from .extensions import parts, schemas
+from .extensions import registered, schemas
 from .fields import (
     Duration,
     EnvironmentName,
@@ -218,7 +218,7 @@ else:
         "WithExtensions",
         __base__=PublishedSection,
         **{
-            key: (schema | None, Field(None, description=parts("outputs")[key][1].text))
+            key: (schema | None, Field(None, description=registered("outputs")[key][1].text))
             for key, schema in schemas("outputs").items()
         },
     )

@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING, Any, NamedTuple, Protocol
 
 import numpy as np
 
-from config.extensions import maker, parts
+from config.extensions import maker, registered
 from config.output_schema import AlertSection
 from estimators.errors import NisusError
 
@@ -138,7 +138,7 @@ class Publisher:
 
             mqtt = MqttOutput(section.mqtt, twin.name, lambda: self._engine.model, notices, secrets)
         outputs: list[Output] = [] if mqtt is None else [mqtt]
-        for key in parts("outputs"):
+        for key in registered("outputs"):
             if (own := getattr(section, key, None)) is not None:
                 outputs.append(maker("outputs", key)(own, self._engine, secrets))
         if section.opcua is not None:
