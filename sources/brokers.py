@@ -20,13 +20,9 @@ import numpy as np
 
 from estimators.errors import ConfigError, printable, quoted
 
-from .messages import LATEST, MAX_WAITING, REFUSED, Messages
+from .messages import LATEST, MAX_WAITING, NO_BROKER, REFUSED, REFUSED_MESSAGE, REFUSED_TOPIC, RETRY_S, Messages
 from .source import Report
 from .tables.text import no_value
-
-NO_BROKER = "no broker"  # Key of the times at which the connection was lost
-REFUSED_MESSAGE = "message refused"  # Key of messages that cannot be read
-REFUSED_TOPIC = "topic refused"  # Key of topics that the broker does not deliver
 
 SHARED = re.compile(r"^\$share/[^/]+/")
 """Begins the filter of a shared subscription, but not the topics of its messages."""
@@ -50,7 +46,7 @@ MAX_BATCH = 20_000
 NO_EXPIRY_S = 2**32 - 1
 """Expiry of a session of MQTT 5 that is kept until the broker's own limit."""
 
-RETRY_S, CHECK_S, STOP_TIMEOUT_S = 1.0, 1.0, 2.0
+CHECK_S, STOP_TIMEOUT_S = 1.0, 2.0
 
 
 class BrokerSection(Protocol):

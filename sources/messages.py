@@ -24,6 +24,11 @@ from .tables.times import ns_of_iso
 ACCEPTED, DUPLICATE, REFUSED = "accepted", "duplicate", "refused"
 """Whether a message was taken."""
 
+NO_BROKER = "no broker"  # Key of the times at which the connection was lost
+REFUSED_MESSAGE = "message refused"  # Key of messages that cannot be read
+REFUSED_TOPIC = "topic refused"  # Key of topics that the broker does not deliver
+RETRY_S = 1.0  # Until a broker, server or device that was lost is tried again
+
 FIELDS = ("time", "values", "source", "sequence")
 """Fields of a message."""
 

@@ -12,8 +12,7 @@ from config.source_schema import SimulatorSection
 from estimators.errors import ConfigError, SourceError
 from estimators.late import inflated
 from estimators.log import TRUTH, Log
-from sources.brokers import NO_BROKER, REFUSED_MESSAGE, REFUSED_TOPIC
-from sources.messages import FORGOTTEN
+from sources.messages import FORGOTTEN, NO_BROKER, REFUSED_MESSAGE, REFUSED_TOPIC
 from sources.source import LOST_FRAMES, NEVER, NO_ASSET, TRUNCATED, UNASSIGNED, UNDATED, WRONG_TIME, is_endless
 from sources.tables.order import REMARKS as ORDER
 from sources.tables.text import UNREADABLE

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any
 
 from config.channels import ColumnSection
 from config.fleet_schema import ASSET_LEVEL, FleetMqttSection, FleetPushSection
-from config.source_schema import ModbusSourceSection, MqttSourceSection, OpcUaSourceSection, PushSection
+from config.source_schema import MqttSourceSection, OpcUaSourceSection, PushSection
 from config.yaml_files import Key
 from estimators.errors import nearest, shown_name
 from estimators.model.state_space import StateSpaceModel
@@ -25,10 +25,7 @@ if TYPE_CHECKING:
 TOPIC_FILTER = re.compile(r"(?:(?:[^#+/\x00]*|\+)/)*(?:[^#+/\x00]*|\+|#)")
 """Topics with wildcards, as brokers take them."""
 
-MAX_REGISTERS = 65_536
-"""Registers of a table of a Modbus device."""
-
-MessageSection = PushSection | MqttSourceSection | OpcUaSourceSection | ModbusSourceSection
+MessageSection = PushSection | MqttSourceSection | OpcUaSourceSection
 
 
 def messages_of(opening: Opening, key: str = "", named: Iterable[str] = ()) -> Messages:
@@ -110,28 +107,6 @@ def _open_opcua(opening: Opening) -> Source:
     return OpcUaSource(messages, section.url, section.nodes, period=section.every, report=opening.report)
 
 
-def _open_modbus(opening: Opening) -> Source:
-    from sources.modbus import ModbusSource, Register
-
-    section: ModbusSourceSection = opening.section
-    messages = messages_of(opening, "registers", section.registers)
-    registers = {name: Register(**item.model_dump()) for name, item in section.registers.items()}
-    for name, item in registers.items():
-        last = MAX_REGISTERS - item.size
-        if item.address > last:
-            text = f"is {item.address}; a {item.type} has {item.size} registers, so it is at most {last}"
-            raise failure(opening.loaded, (*opening.key, "registers", name, "address"), text)
-    return ModbusSource(
-        messages,
-        registers,
-        host=section.host,
-        port=section.port,
-        device=section.device,
-        period=section.every,
-        report=opening.report,
-    )
-
-
 def with_channels(section: MessageSection, model: StateSpaceModel) -> MessageSection:
     """Return a section with its channels; of one without any, all sensors and inputs by their own names."""
     if _sections(section, ()):
@@ -157,4 +132,3 @@ def of_messages(open_: Callable[[Opening], Source], files: Callable[[Opening], o
 PUSH = of_messages(messages_of)
 MQTT = of_messages(_open_mqtt, files=_check_secrets)
 OPC_UA = of_messages(_open_opcua)
-MODBUS = of_messages(_open_modbus)

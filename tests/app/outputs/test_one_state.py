@@ -22,7 +22,7 @@ from estimators.log import READING, Log
 from sources.source import ignore
 from tests import ROOT
 from tests.app.outputs.broker import Broker, Listener
-from tests.app.outputs.modbus_device import Device
+from tests.extensions.modbus.device import Device
 from tests.app.outputs.pushed import BEGIN, push, pushed_twin
 from tests.app.outputs.test_alerts import state
 from tests.app.scripted import notice_texts, pull_all

@@ -8,14 +8,19 @@ import time
 from collections.abc import Mapping
 from typing import Any, NamedTuple
 
+from app.twin.sources.kind import Opening, failure
+from app.twin.sources.push import messages_of
 from estimators.errors import ConfigError, printable
+from sources.messages import NO_BROKER, REFUSED, REFUSED_MESSAGE, RETRY_S, Messages
+from sources.source import Report, Source
 
-from .brokers import NO_BROKER, REFUSED_MESSAGE, RETRY_S
-from .messages import REFUSED, Messages
-from .source import Report
+from .schema import ModbusSourceSection
 
 NO_REGISTER = "no register"  # Key of registers that the device does not give
 ANSWER_TIMEOUT_S = 1.0
+
+MAX_REGISTERS = 65_536
+"""Registers of a table of a Modbus device."""
 
 BIT_TABLES = ("coil", "discrete")
 MAX_COUNT = {"holding": 125, "input": 125, "coil": 2000, "discrete": 2000}
@@ -94,7 +99,7 @@ class ModbusSource:
         try:
             from pymodbus.client import ModbusTcpClient
         except ModuleNotFoundError:
-            raise ConfigError("Modbus needs pymodbus: pip install 'nisus[service]'") from None
+            raise ConfigError("Modbus needs pymodbus: pip install 'nisus[modbus]'") from None
         logging.getLogger("pymodbus").addHandler(logging.NullHandler())  # what it logs is reported here, in one line
         self._messages, self._registers, self._report = messages, registers, report
         self.read, self.now = messages.read, messages.now
@@ -164,3 +169,28 @@ class ModbusSource:
         self._stopping.set()
         self._client.close()
         self._thread.join(2.0 * ANSWER_TIMEOUT_S)
+
+
+def open_modbus(opening: Opening) -> Source:
+    """Open the source of a section.
+
+    Raises:
+        SourceError: If a register or a value does not exist.
+    """
+    section: ModbusSourceSection = opening.section
+    messages = messages_of(opening, "registers", section.registers)
+    registers = {name: Register(**item.model_dump()) for name, item in section.registers.items()}
+    for name, item in registers.items():
+        last = MAX_REGISTERS - item.size
+        if item.address > last:
+            text = f"is {item.address}; a {item.type} has {item.size} registers, so it is at most {last}"
+            raise failure(opening.loaded, (*opening.key, "registers", name, "address"), text)
+    return ModbusSource(
+        messages,
+        registers,
+        host=section.host,
+        port=section.port,
+        device=section.device,
+        period=section.every,
+        report=opening.report,
+    )

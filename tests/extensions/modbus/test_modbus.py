@@ -5,11 +5,11 @@ import struct
 import numpy as np
 import pytest
 
+from app.extensions.modbus.source import ModbusSource, Register, blocks_of
 from estimators.log import READING
 from sources.messages import Messages
-from sources.modbus import ModbusSource, Register, blocks_of
 from sources.source import Channel
-from tests.app.outputs.modbus_device import Device
+from tests.extensions.modbus.device import Device
 from tests.waiting import wait_for
 
 FORMATS = dict(int16="h", uint16="H", int32="i", uint32="I", int64="q", uint64="Q", float32="f", float64="d")

@@ -1,0 +1,62 @@
+"""Section of the YAML: registers of a Modbus TCP device as source."""
+
+from __future__ import annotations
+
+from typing import Annotated, Any, Literal
+
+from pydantic import BeforeValidator, Field, model_validator
+
+from config.channels import ColumnSection
+from config.fields import Host, Port, Seconds, Section, Text, refused
+
+
+class RegisterSection(Section):
+    """Where a Modbus device has a value."""
+
+    address: Annotated[int, Field(strict=True, ge=0, le=65535)]
+    """Address as sent, from 0 on: 0 for the register that many manuals call 40001 or 30001."""
+    table: Literal["holding", "input", "coil", "discrete"] = "holding"
+    """holding (4xxxx) or input (3xxxx) registers, or the bits coil (0xxxx) or discrete (1xxxx). Default: holding."""
+    type: Literal["int16", "uint16", "int32", "uint32", "int64", "uint64", "float32", "float64"] = "uint16"
+    """Type of the number in the registers; bits have none. Default: uint16."""
+    words: Literal["big", "little"] = "big"
+    """Order of the registers of a longer number: big if the first one has its highest bits. Default: big."""
+
+    @model_validator(mode="after")
+    def _bit(self) -> RegisterSection:
+        if self.table in ("coil", "discrete") and {"type", "words"} & self.model_fields_set:
+            raise refused("relation", f"is {self.table}, a bit; leave type and words out, or read a register", "table")
+        return self
+
+
+def _register(value: Any) -> Any:
+    return {"address": value} if isinstance(value, int) else value
+
+
+class ModbusSourceSection(Section):
+    """Registers of a Modbus TCP device, read again and again."""
+
+    type: Literal["modbus"]
+    """modbus"""
+    host: Host
+    """Name or address of the device."""
+    port: Port = 502
+    """Its port. Default: 502."""
+    device: Annotated[int, Field(strict=True, ge=0, le=255)] = 1
+    """Its number behind a gateway (unit identifier). Default: 1."""
+    every: Seconds = 1.0
+    """Seconds between two readings. Each is a measurement: read no faster than the device measures. Default: 1."""
+    registers: Annotated[
+        dict[
+            Text,
+            Annotated[RegisterSection, BeforeValidator(_register, json_schema_input_type=int | RegisterSection)],
+        ],
+        Field(min_length=1),
+    ]
+    """Registers by the names of their values: {LT101: {address: 100, type: float32}, FT101: 102}."""
+    sensors: dict[str, ColumnSection] = {}
+    """Sensors of the model and the names of the values that feed them. Default: all, by the model's names."""
+    inputs: dict[str, ColumnSection] = {}
+    """Inputs of the model and the names of the values that feed them."""
+    truth: dict[str, ColumnSection] = {}
+    """States whose true value the device has too. They are scored, never used."""
