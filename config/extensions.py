@@ -51,7 +51,8 @@ class Extension:
     outputs: Mapping[str, Part] = field(default_factory=dict)
     """By key under `outputs`. `make(section, engine, secrets)` returns an `app.outputs.Output`."""
     receivers: Mapping[str, Part] = field(default_factory=dict)
-    """Receivers of alerts, by `type`. `make(section, folder, secrets)` returns an `app.outputs.receivers.Receiver`."""
+    """Receivers of alerts, by `type`; `make(section, folder, secrets)` returns an `app.outputs.receivers.Receiver`. An
+    output of the same name is the receiver itself."""
 
 
 Kind = Literal["commands", "sources", "outputs", "receivers"]

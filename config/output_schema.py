@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Annotated, Any, Literal, Union
+from typing import TYPE_CHECKING, Annotated, Literal, Union
 
 from pydantic import BeforeValidator, Field, create_model, model_validator
 
@@ -21,7 +21,6 @@ from .fields import (
     one_of,
     refused,
 )
-from .source_schema import BrokerSection
 
 Url = Annotated[str, Field(pattern=r"^(https?://\S+|\$[A-Za-z_][A-Za-z0-9_]*)$")]
 
@@ -82,14 +81,7 @@ class CommandSection(Section):
     """Seconds after which it is ended. Default: 30."""
 
 
-class MqttReceiverSection(Section):
-    """A receiver of alerts: the broker of `outputs.mqtt`, under the topic PREFIX/TWIN/alert."""
-
-    type: Literal["mqtt"]
-    """mqtt"""
-
-
-CoreReceiver = WebhookSection | EmailSection | CommandSection | MqttReceiverSection
+CoreReceiver = WebhookSection | EmailSection | CommandSection
 if TYPE_CHECKING:
     ReceiverSection = CoreReceiver
 else:
@@ -151,51 +143,6 @@ class AlertSection(Section):
         return "episode" if self.episode is not None else "nis" if self.nis is not None else "lost"
 
 
-class MqttSection(BrokerSection):
-    """Publication of the state at an MQTT broker, under the topics PREFIX/TWIN/state, birth, status and alert."""
-
-    prefix: Annotated[str, Field(pattern=r"^[^+#\x00]+$")] = "nisus"
-    """First part of the topics. Default: nisus."""
-
-
-class OpcUaSection(Section):
-    """An OPC UA server with the states as variables."""
-
-    host: Host = "127.0.0.1"
-    """Address at which it listens. Default: 127.0.0.1; any other needs user and password_env."""
-    port: Port = 4840
-    """Its port. Default: 4840."""
-    user: Text | None = None
-    """Name of the only user who may read. Default: everyone on this machine."""
-    password_env: EnvironmentName | None = None
-    """Environment variable with the password."""
-
-    @model_validator(mode="after")
-    def _guarded(self) -> OpcUaSection:
-        if (self.user is None) != (self.password_env is None):
-            raise refused("absent", "needs both user and password_env, or neither")
-        if self.user is None and self.host not in ("127.0.0.1", "localhost", "::1"):
-            raise refused("relation", "is not this machine; give user and password_env too", "host")
-        return self
-
-
-class CanOutputSection(Section):
-    """The estimate as frames on a CAN bus, two for each state, described by a DBC."""
-
-    interface: Text
-    """Interface of python-can: socketcan, virtual, udp_multicast, ..."""
-    channel: Annotated[int, Field(strict=True)] | str
-    """Channel of the interface."""
-    options: dict[str, Any] = {}
-    """Further arguments of python-can's interface. Default: none."""
-    id: Annotated[int, Field(strict=True, ge=0, le=0x1FFFFFFF)]
-    """Identifier of the first frame; each state takes two. None may be one of the source's databases."""
-    extended: Annotated[bool, Field(strict=True)] = False
-    """Whether the identifiers have 29 bits. Default: false, 11 bits."""
-    dbc: Text
-    """DBC file that is written when the twin starts, beside this YAML."""
-
-
 class PublishedSection(Section):
     """How often the state is published, and what of it."""
 
@@ -203,12 +150,6 @@ class PublishedSection(Section):
     """Seconds between two states that are published; 0 publishes after each batch of measurements. Default: 0.1."""
     covariance: Annotated[bool, Field(strict=True)] = False
     """Whether published messages have the covariance of all states. Default: false."""
-    mqtt: MqttSection | None = None
-    """MQTT broker to which the state is published: {host, port, prefix, ...}. Default: none."""
-    opcua: OpcUaSection | None = None
-    """OPC UA server with the states as variables: {host, port, ...}. Default: none."""
-    can: CanOutputSection | None = None
-    """CAN bus on which the estimate is a virtual sensor: {interface, channel, id, dbc, ...}. Default: none."""
 
 
 if TYPE_CHECKING:

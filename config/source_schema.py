@@ -279,93 +279,6 @@ class PushSection(Section):
     """States whose true value is sent too. They are scored, never used."""
 
 
-class TopicSection(Section):
-    """Payloads of one MQTT topic, as JSON. Paths are dotted: data.level, or items.0.v; "" is the whole payload."""
-
-    values: dict[Text, str] = {}
-    """Path of each value by its name. Default: the payload is a message as of POST /api/readings."""
-    time: Text | None = None
-    """Path of the time: ISO 8601, or a number. Default: the time of arrival."""
-    unit: Literal["s", "ms", "us", "ns"] = "ns"
-    """Unit of a time in numbers, since 1970. Default: ns."""
-    quality: Text | None = None
-    """Path of the quality of the values. Default: none, all are good."""
-    good: Annotated[tuple[Text, ...], BeforeValidator(lambda value: [str(item) for item in as_list(value) or []])] = (
-        "Good",
-        "good",
-        "GOOD",
-        "192",
-        "True",
-    )
-    """Qualities of good values; with any other the values are missing. Default: Good, 192 and true."""
-    sequence: Text | None = None
-    """Path of a sequence number: a message of the same topic and number is taken once. Default: none."""
-
-
-def _topic(value: Any) -> Any:
-    return {"values": {value: ""}} if isinstance(value, str) else {} if value is None else value
-
-
-class BrokerSection(Section):
-    """An MQTT broker."""
-
-    host: Annotated[str, Field(pattern=r"^[^\s/]+$")]
-    """Name or address of the broker."""
-    port: Annotated[int, Field(strict=True, ge=1, le=65535)] = 1883
-    """Its port. Default: 1883; 8883 is usual with TLS."""
-    user: Text | None = None
-    """User name. Default: none."""
-    password_env: Annotated[str, Field(pattern=r"^[A-Za-z_][A-Za-z0-9_]*$")] | None = None
-    """Environment variable with the password. Default: none."""
-    ca_file: Text | None = None
-    """Certificate of the authority that signed the broker's, for TLS. Default: none, no encryption."""
-
-
-class MqttSourceSection(BrokerSection):
-    """Topics of an MQTT broker."""
-
-    type: Literal["mqtt"]
-    """mqtt"""
-    topics: Annotated[
-        dict[
-            Text,
-            Annotated[TopicSection, BeforeValidator(_topic, json_schema_input_type=str | TopicSection | None)],
-        ],
-        Field(min_length=1),
-    ]
-    """Topics, + and # included, and their payloads: the name of a value, {plant/LT101: LT101}, if the payload is a
-    number; {values, time, quality, ...} if it is JSON; null if it is a message as of POST /api/readings."""
-    qos: Annotated[int, Field(strict=True, ge=0, le=2)] = 1
-    """Quality of service. Default: 1."""
-    client_id: Text | None = None
-    """Name of the session, under which the broker keeps messages while the twin is away. Default: none, it does not."""
-    sensors: dict[str, ColumnSection] = {}
-    """Sensors of the model and the names of the values that feed them. Default: all, by the model's names."""
-    inputs: dict[str, ColumnSection] = {}
-    """Inputs of the model and the names of the values that feed them."""
-    truth: dict[str, ColumnSection] = {}
-    """States whose true value is sent too. They are scored, never used."""
-
-
-class OpcUaSourceSection(Section):
-    """Nodes of an OPC UA server, by subscription."""
-
-    type: Literal["opcua"]
-    """opcua"""
-    url: Annotated[str, Field(pattern=r"^opc\.tcp://\S+$")]
-    """Address of the server: opc.tcp://plc.local:4840."""
-    nodes: Annotated[dict[Text, Text], Field(min_length=1)]
-    """Node ids by the names of their values: {LT101: "ns=2;s=Tank.Level"}."""
-    every: Seconds = 0.1
-    """Publishing interval, s. Default: 0.1."""
-    sensors: dict[str, ColumnSection] = {}
-    """Sensors of the model and the names of the values that feed them. Default: all, by the model's names."""
-    inputs: dict[str, ColumnSection] = {}
-    """Inputs of the model and the names of the values that feed them."""
-    truth: dict[str, ColumnSection] = {}
-    """States whose true value the server has too. They are scored, never used."""
-
-
 PartSection = Annotated[CanLogSection | TableSection, Field(discriminator="type")]
 """Recordings that can be merged."""
 
@@ -385,16 +298,7 @@ class MergedSection(Section):
         return self
 
 
-CoreSource = (
-    SimulatorSection
-    | CanSection
-    | CanLogSection
-    | TableSection
-    | MergedSection
-    | PushSection
-    | MqttSourceSection
-    | OpcUaSourceSection
-)
+CoreSource = SimulatorSection | CanSection | CanLogSection | TableSection | MergedSection | PushSection
 if TYPE_CHECKING:
     SourceSection = CoreSource
 else:

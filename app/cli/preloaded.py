@@ -15,7 +15,6 @@ import uvicorn.loops.auto
 import uvicorn.protocols.websockets.auto  # noqa: F401
 from numba.core.registry import cpu_target
 
-from config.fleet_schema import FleetSection
 from config.schema import TwinSection
 from sources import pacer
 from sources.tables import table
@@ -29,6 +28,5 @@ __all__ = ["open_twin", "pacer", "rows", "serve", "server", "table", "view"]
 
 cpu_target.typing_context.refresh()
 cpu_target.target_context.refresh()
-for section in (TwinSection, FleetSection):
-    section.model_rebuild()
+TwinSection.model_rebuild()
 imageio.v3.imwrite("<bytes>", np.zeros((1, 1, 3), np.uint8), extension=".jpeg")  # Pillow looks for its formats

@@ -132,28 +132,16 @@ class Publisher:
         twin, notices = self._engine.twin, self._engine.notices
         section, rules = twin.config.outputs, twin.config.alerts
         secrets = secrets_of(section, twin.loaded.places)
-        mqtt = None
-        if section.mqtt is not None:
-            from .mqtt import MqttOutput
-
-            mqtt = MqttOutput(section.mqtt, twin.name, lambda: self._engine.model, notices, secrets)
-        outputs: list[Output] = [] if mqtt is None else [mqtt]
-        for key in registered("outputs"):
-            if (own := getattr(section, key, None)) is not None:
-                outputs.append(maker("outputs", key)(own, self._engine, secrets))
-        if section.opcua is not None:
-            from .opcua import OpcUaOutput
-
-            outputs.append(OpcUaOutput(section.opcua, self._engine, secrets))
-        if section.can is not None:
-            from .can import CanOutput
-
-            outputs.append(CanOutput(section.can, self._engine, twin.path.absolute().parent))
-        deliveries = Deliveries(section.receivers, twin.path.absolute().parent, mqtt, notices, secrets)
+        outputs: dict[str, Output] = {
+            key: maker("outputs", key)(own, self._engine, secrets)
+            for key in registered("outputs")
+            if (own := getattr(section, key, None)) is not None
+        }
+        deliveries = Deliveries(section.receivers, twin.path.absolute().parent, outputs, notices, secrets)
         if deliveries.queues and not rules:
             rules = (HEALTH_RULE,)
         jobs = Jobs(notices, "output", threads=1 + len(deliveries.queues), niceness=0)
-        return Parts(twin.config, tuple(outputs), AlertRules(rules, link=self._page), deliveries, jobs)
+        return Parts(twin.config, tuple(outputs.values()), AlertRules(rules, link=self._page), deliveries, jobs)
 
     def _begin(self) -> None:
         parts = self._parts

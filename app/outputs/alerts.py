@@ -9,11 +9,10 @@ import hashlib
 import math
 import time
 from collections.abc import Callable, Iterator, Sequence
-from typing import TYPE_CHECKING, Any, Literal, NamedTuple, TypeVar
+from typing import TYPE_CHECKING, Any, Literal, NamedTuple, Protocol, TypeVar
 
 from pydantic import BaseModel, ConfigDict, Field
 
-from config.fleet_schema import FleetAlertSection
 from config.output_schema import AlertSection
 from estimators.diagnostics.detectors import anchor
 from estimators.errors import printable
@@ -120,7 +119,15 @@ def tail(over: float, std: float) -> float:
     return 0.5 * math.erfc(-over / (std * math.sqrt(2.0)))
 
 
-Rule = TypeVar("Rule", AlertSection, FleetAlertSection)
+class Titled(Protocol):
+    """A rule for alerts, of a twin or of many assets."""
+
+    @property
+    def title(self) -> str:
+        """Name of the rule, or its condition."""
+
+
+Rule = TypeVar("Rule", bound=Titled)
 
 
 def numbered(rules: Sequence[Rule]) -> dict[tuple[str, str], Rule]:

@@ -27,6 +27,7 @@ from typing import Any, Protocol
 from urllib.error import HTTPError, URLError
 from urllib.request import HTTPHandler, HTTPRedirectHandler, HTTPSHandler, Request, build_opener
 
+from config.extensions import maker
 from config.output_schema import CommandSection, EmailSection, WebhookSection
 from estimators.compiled.orphan import killed_with_parent
 from estimators.errors import printable
@@ -312,19 +313,19 @@ class Deliveries:
     """Queues of all receivers, and their messages that a twin or fleet runs."""
 
     def __init__(
-        self, sections: Mapping[str, Any], folder: Path, mqtt: Receiver | None, notices: Notices, secrets: Secrets
+        self, sections: Mapping[str, Any], folder: Path, outputs: Mapping[str, Any], notices: Notices, secrets: Secrets
     ) -> None:
         """Make the receivers.
 
         Args:
             sections: Receivers of the YAML by name.
             folder: Folder of the YAML.
-            mqtt: Receiver of type mqtt.
+            outputs: The outputs by key, of which one is the receiver of its name.
             notices: Where alerts and failures are reported.
             secrets: See `secrets_of`.
         """
         self._notices = notices
-        made = make_receivers(sections, folder, mqtt, secrets)
+        made = make_receivers(sections, folder, outputs, secrets)
         self.queues = {name: Delivery(name, item, notices) for name, item in made.items()}
         periods = {name: getattr(item, "heartbeat", None) for name, item in sections.items()}
         self._periods = {name: period for name, period in periods.items() if period is not None}
@@ -371,7 +372,7 @@ class Deliveries:
 
 
 def make_receivers(
-    sections: Mapping[str, Any], folder: Path, mqtt: Receiver | None, secrets: Secrets
+    sections: Mapping[str, Any], folder: Path, outputs: Mapping[str, Any], secrets: Secrets
 ) -> dict[str, Receiver]:
     """Return the receivers by name."""
     found: dict[str, Receiver] = {}
@@ -382,6 +383,8 @@ def make_receivers(
             found[name] = Mail(section, secrets)
         elif isinstance(section, CommandSection):
             found[name] = CommandReceiver(section, folder)
-        elif mqtt is not None:
-            found[name] = mqtt
+        elif section.type in outputs:
+            found[name] = outputs[section.type]
+        else:
+            found[name] = maker("receivers", section.type)(section, folder, secrets)
     return found

@@ -5,9 +5,7 @@ from __future__ import annotations
 from collections.abc import Collection, Iterable, Sequence
 from typing import Any
 
-from config.fleet_schema import FleetAlertSection, FleetOutputsSection
 from config.loader import Loaded
-from config.output_schema import AlertSection, OutputsSection
 from config.schema import PriorSection, SensorSection
 from config.yaml_files import Key
 from estimators.diagnostics.detectors import ALARM_NAMES, CAUSES
@@ -154,17 +152,16 @@ def check_outputs(loaded: Loaded, model: StateSpaceModel) -> None:
             _check_names(loaded, ("alerts", k, key), given, known, kind)
 
 
-def check_receivers(
-    loaded: Loaded, outputs: OutputsSection | FleetOutputsSection, rules: Sequence[AlertSection | FleetAlertSection]
-) -> None:
+def check_receivers(loaded: Loaded, outputs: Any, rules: Sequence[Any]) -> None:
     """Refuse rules of alerts, of a twin or a fleet, that name no receiver.
 
     Raises:
         ConfigError: With file and line, and the near names.
     """
     for name, section in outputs.receivers.items():
-        if section.type == "mqtt" and outputs.mqtt is None:
-            raise loaded.error(("outputs", "receivers", name), "is of type mqtt; give the broker under outputs.mqtt")
+        if getattr(outputs, section.type, section) is None:
+            text = f"is of type {section.type}; give the broker under outputs.{section.type}"
+            raise loaded.error(("outputs", "receivers", name), text)
     for k, rule in enumerate(rules):
         receivers = tuple(outputs.receivers)
         _check_names(loaded, ("alerts", k, "to"), rule.to or (), receivers, "receiver under outputs.receivers")

@@ -23,7 +23,7 @@ from .defaults import rhythm
 from .sources.asset import SIMULATOR
 from .sources.can import CAN, CAN_LOG, make_player
 from .sources.kind import Kind, Opening, find_databases, find_recording
-from .sources.push import MQTT, OPC_UA, PUSH, of_messages
+from .sources.push import PUSH, of_messages
 from .sources.recordings import MERGED, TABLE
 
 if TYPE_CHECKING:
@@ -225,8 +225,6 @@ SOURCES: dict[str, Kind] = {
     "table": TABLE,
     "merged": MERGED,
     "push": PUSH,
-    "mqtt": MQTT,
-    "opcua": OPC_UA,
 }
 """Those of the core, by the `type` of the section."""
 

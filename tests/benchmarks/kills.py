@@ -29,20 +29,21 @@ from typing import Any, NamedTuple, cast
 import numpy as np
 import pyarrow.parquet
 
-from app.live.fleet import RunningFleet
+from app.extensions.fleet.plan import load_fleet
+from app.extensions.fleet.running import RunningFleet
+from app.extensions.fleet.table import arrow_table, in_name_order
+from app.extensions.mqtt.client import mqtt_client
+from app.extensions.mqtt.source import MqttSource, TopicMap
 from app.live.store import Store, read_store
-from app.present.fleet_table import arrow_table, in_name_order
 from app.terminal import EndRequest, when_asked_to_end
-from app.twin.fleet import load_fleet
 from app.twin.twin import Twin, load_twin
 from app.web.readings import messages_of
 from app.web.running import OpenedTwin, RunningTwin
 from estimators.log import READING, Events, Log
 from estimators.snapshots import Base
-from sources.brokers import MqttSource, TopicMap, mqtt_client
 from sources.messages import ACCEPTED
 from tests import ROOT
-from tests.app.outputs.broker import Broker
+from tests.extensions.mqtt.broker import Broker
 
 PERIOD_S = 0.001
 LATE_EVERY, LATE_S = 50, 0.02

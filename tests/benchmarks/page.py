@@ -34,9 +34,9 @@ import pyarrow.parquet
 from app.views.recording.reader import read_recording
 from estimators.errors import SourceError
 from estimators.log import READING
-from tests.app.cli.test_fleet import FLEET, pump_rows
-from tests.app.cli.test_fleet import write as write_table
 from tests.chromium import find_chromium, launched
+from tests.extensions.fleet.test_command import FLEET, pump_rows
+from tests.extensions.fleet.test_command import write as write_table
 
 from .timing import BenchmarkRow, Bound, Section, run_sections
 
@@ -373,10 +373,10 @@ def published(seconds: float = 15.0, rate: float = 1000.0) -> Iterator[Benchmark
     Raises:
         SourceError: If there is no Mosquitto.
     """
-    from sources.brokers import mqtt_client
+    from app.extensions.mqtt.client import mqtt_client
+    from tests.extensions.mqtt.broker import Broker
+    from tests.extensions.test_one_state import Plant
 
-    from ..app.outputs.broker import Broker
-    from ..app.outputs.test_one_state import Plant
     from ..skips import find_program
     from ..support import free_port
 

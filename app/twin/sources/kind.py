@@ -30,8 +30,8 @@ T = TypeVar("T")
 class Opening:
     """A section that is to be opened: its twin, its place in the YAML, and for what.
 
-    `live` False takes a recording in place of a bus; `log_files` are recordings in place of its own. `assets` are those
-    of a fleet, if they are named; with `stored` its state is kept.
+    `live` False takes a recording in place of a bus; `log_files` are recordings in place of its own. With
+    `of_assets` it is that of a fleet: `assets` are its own, if they are named; with `stored` its state is kept.
     """
 
     loaded: Loaded
@@ -41,6 +41,7 @@ class Opening:
     report: Report
     live: bool = True
     log_files: Sequence[Path] | None = None
+    of_assets: bool = False
     assets: tuple[str, ...] = ()
     stored: bool = False
 

@@ -9,7 +9,6 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from config.fleet_schema import FleetTableSection
 from config.source_schema import CanLogSection, MergedSection, TableSection
 from config.yaml_files import Key
 from estimators.errors import SourceError
@@ -116,7 +115,7 @@ def _open_table(opening: Opening) -> Source:
     from sources.tables.table import Table
 
     section: TableSection = opening.section
-    if isinstance(section, FleetTableSection) or (section.follow and opening.live and opening.log_files is None):
+    if opening.of_assets or (section.follow and opening.live and opening.log_files is None):
         return _follow(opening, section)
     files = find_recording(opening.loaded, section, opening.key, opening.log_files)
 
@@ -143,7 +142,7 @@ def _follow(opening: Opening, section: TableSection) -> Source:
     from sources.tables.times import TimeColumn
 
     recorded = [] if section.follow else find_recording(opening.loaded, section, opening.key, None)
-    asset = section.asset if isinstance(section, FleetTableSection) else None
+    asset = getattr(section, "asset", None)
 
     def files() -> list[Path]:
         found = [path for pattern in section.files for path in matching(opening.loaded, section, pattern)]

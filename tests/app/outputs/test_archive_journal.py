@@ -2,8 +2,8 @@
 
 from itertools import pairwise
 
+from app.extensions.fleet.archive import AssetHistory
 from app.outputs import archive_journal
-from app.outputs.fleet_archive import AssetHistory
 from app.outputs.parts import parts_of
 from tests.app.outputs.written_archive import Written
 

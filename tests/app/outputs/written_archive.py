@@ -4,8 +4,8 @@ import numpy as np
 import pyarrow as pa
 import pyarrow.parquet as pq
 
+from app.extensions.fleet.archive import FleetArchive
 from app.outputs.archive_journal import read_journal
-from app.outputs.fleet_archive import FleetArchive
 from app.outputs.parts import ArchivePlan, parts_of
 from app.twin.twin import load_twin
 from app.views.recording.rrd_file import parse_split

@@ -400,10 +400,11 @@ def test_every_type_of_the_schema_has_its_line_in_the_registry():
     from typing import get_args
 
     from app.twin.source import SOURCES
+    from config.extensions import registered
     from config.source_schema import SourceSection
 
     types = [get_args(section.model_fields["type"].annotation)[0] for section in get_args(get_args(SourceSection)[0])]
-    assert sorted(types) == sorted(SOURCES)
+    assert sorted(types) == sorted([*SOURCES, *registered("sources")])
 
 
 THREE = """\

@@ -1,0 +1,8 @@
+"""Many assets of one twin, folded together: `nisus fleet FLEET.yaml`."""
+
+from config.extensions import Extension, Part
+
+EXTENSION = Extension(
+    needs=("mqtt",),
+    commands={"fleet": Part(f"{__name__}.arguments:FleetCommand", f"{__name__}.command:run_fleet")},
+)
