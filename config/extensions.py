@@ -54,6 +54,11 @@ class Extension:
     """Receivers of alerts, by `type`; `make(section, folder, secrets)` returns an `app.outputs.receivers.Receiver`. An
     output of the same name is the receiver itself."""
 
+    hooks: Mapping[str, str] = field(default_factory=dict)
+    """References to functions that the core calls. `routes(engine)` returns routes beside those of the page, as
+    `app.web.http.get` makes them. `archive(folder, split, engine, stored)` returns what archives the rows of a running
+    twin between its `start` and `stop`."""
+
 
 Kind = Literal["commands", "sources", "outputs", "receivers"]
 TAGGED = ("sources", "receivers")
@@ -121,8 +126,29 @@ def maker(kind: Kind, key: str) -> Callable[..., Any]:
         ConfigError: If it cannot be imported.
     """
     name, part = registered(kind)[key]
+    return _imported(name, part.make)
+
+
+def hooks(key: str) -> list[Callable[..., Any]]:
+    """Return the functions of all extensions that have this hook, without those that cannot be imported."""
+    named = ((name, item.hooks[key]) for name, item in extensions().items() if key in item.hooks)
+    return [found for name, reference in named if (found := _tried(name, partial(_imported, name, reference)))]
+
+
+def hook(key: str, asked: str) -> Callable[..., Any]:
+    """Return the function of the first extension that has a hook.
+
+    Raises:
+        ConfigError: If none has it; `asked` is what needs it.
+    """
+    if not (found := hooks(key)):
+        raise ConfigError(f"{asked}: needs an extension that is not installed{left_out()}")
+    return found[0]
+
+
+def _imported(name: str, reference: str) -> Any:
     try:
-        return pkgutil.resolve_name(part.make)
+        return pkgutil.resolve_name(reference)
     except Exception as error:  # noqa: BLE001  the module may be of a third party
         raise ConfigError(f"extension {name}: {_gist(error)}; install its package again") from None
 

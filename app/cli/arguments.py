@@ -171,6 +171,8 @@ class RunCommand(JsonOption, ArchiveOptions, PageOptions, TuningOption, Estimato
       nisus run motor_can --headless --record drive.rrd
     """
 
+    from_environment = True
+
     twin: OptionalTwin = None
     """Name of a bundled twin (see `nisus twins`), or path to a YAML file. Default: choose one in the gallery."""
     set: Repeated = ()
@@ -194,45 +196,6 @@ class RunCommand(JsonOption, ArchiveOptions, PageOptions, TuningOption, Estimato
     """Run without a page, to the end of the source, and print the counts of events (--json: as JSON)."""
     log_format: Literal["text", "json"] | None = None
     """Print the notices of the twin and errors on standard error, as lines of text or of JSON."""
-
-
-@dataclass(frozen=True, kw_only=True)
-class ServiceOptions:
-    """Options of a command that serves pages of several twins."""
-
-    port: int = 9900
-    """Port of the overview; 0 picks a free one."""
-    host: str = "127.0.0.1"
-    """IP address to listen on; any other than a loopback address needs --tokens."""
-    public: str | None = None
-    """Address at which a reverse proxy offers the service, https://HOST; needs --tokens."""
-    tokens: Path | None = None
-    """File of tokens for users and programs, a line NAME ROLE TOKEN each; roles are view, feed, tune and admin."""
-    duration: float | None = None
-    """Stop after this many seconds."""
-
-
-@dataclass(frozen=True)
-class ServeCommand(ArchiveOptions, ServiceOptions):
-    """Run several twins as one service on one port: an overview, the worst health first, and the page of each.
-
-    Each twin is a process of its own; if it ends, it is started again. An option is also taken from the environment:
-    NISUS_SERVE_PORT=8080 is --port 8080, unless that is given.
-
-    Examples:
-      nisus serve pump.yaml fan.yaml --store /var/lib/nisus
-      nisus serve twins/
-      nisus serve twins/ --tokens tokens.txt --public https://twins.example.com
-    """
-
-    twins: Annotated[tuple[str, ...], tyro.conf.Positional] = ()
-    """YAML files, names of bundled twins, or one folder of YAML files, which is watched."""
-    store: Path | None = None
-    """Folder in which each twin keeps its state, TWIN.store, and continues from it after a restart or a kill."""
-    recordings: Path = Path("recordings")
-    """Folder of recordings, with a folder for each twin; created when needed."""
-    log_format: Literal["text", "json"] = "text"
-    """Form of the lines on standard error: notices of the twins, and processes that end."""
 
 
 @dataclass(frozen=True)
@@ -642,23 +605,6 @@ class LogCommand(JsonOption, TableOptions):
 
 
 @dataclass(frozen=True)
-class QueryCommand(JsonOption):
-    """Query an archive with SQL of DuckDB: a view for each twin, by its name, and `archive` with the rows of all.
-
-    Examples:
-      nisus query archive "SELECT count(*) FROM archive"
-      nisus query archive "SELECT health, count(*) FROM motor_can GROUP BY health" --csv
-    """
-
-    folder: Annotated[Path, tyro.conf.Positional]
-    """Folder of the archive, as given to `nisus run --archive`."""
-    sql: Annotated[str, tyro.conf.Positional]
-    """SELECT statement. Columns are those of `nisus fold --out`, and twin, revision, row and archived_ns."""
-    csv: Flag = False
-    """Print the result as CSV."""
-
-
-@dataclass(frozen=True)
 class NewCommand(JsonOption, RoleOptions, TableOptions):
     """Write NAME.yaml and NAME.py, a runnable example (a pump) or a draft from the signals of a recording.
 
@@ -679,7 +625,6 @@ class NewCommand(JsonOption, RoleOptions, TableOptions):
 
 COMMANDS: dict[type, str] = {
     RunCommand: "run:run_twin",
-    ServeCommand: "serve:serve",
     FoldCommand: "fold:fold_twin",
     WhyCommand: "why:explain_change",
     CheckCommand: "check:check_twin",
@@ -698,7 +643,6 @@ COMMANDS: dict[type, str] = {
     TuningsCommand: "tunings:tunings_of",
     SchemaCommand: "new:write_schema",
     LogCommand: "log:show_log",
-    QueryCommand: "query:query",
     NewCommand: "new:new_twin",
 }
 """Module and function of every command, imported when the command runs."""

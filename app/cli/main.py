@@ -25,7 +25,7 @@ from config.yaml_files import shown_path
 from estimators.errors import ConfigError, NisusError, nearest, shown_name
 
 from ..terminal import complain
-from .arguments import COMMANDS, NAMES, RunCommand, ServeCommand
+from .arguments import COMMANDS, NAMES, RunCommand
 from .options import check_options, environment_options
 
 HEAD = """Keep a digital twin in step with its asset: fold, tune, check and watch it.
@@ -76,7 +76,7 @@ def parse(arguments: Sequence[str]) -> Any:
     if name in commands:
         command = commands[name]
         given = [*arguments[1:]]
-        if command in (RunCommand, ServeCommand):
+        if getattr(command, "from_environment", False):
             given += environment_options(name, command, given, os.environ)
         check_options(name, command, given)
         return tyro.cli(command, args=given, prog=f"nisus {name}", description=described(command))

@@ -5,14 +5,15 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 import numpy as np
 
+from config.extensions import hook
 from config.loader import shipped
 
-from ..outputs.parts import ArchivePlan
 from ..twin.log_reader import remarking
 from ..twin.twin import Twin, load_twin, restore_twin
 from ..views.recording.rrd_file import NEVER, Split
@@ -66,9 +67,9 @@ def opened_twin(
     if store is not None and store.is_dir():
         store = store / f"{twin.name}.store"
     source = live_source(twin, speed)
-    plan = None if archive is None else ArchivePlan(archive / twin.name, split)
+    made = None if archive is None else partial(hook("archive", f"--archive {archive}"), archive / twin.name, split)
     stamp = stamp_of(twin.files)
-    return OpenedTwin(twin, source, files=twin.files, stamp=stamp, again=read, store=store, archive=plan)
+    return OpenedTwin(twin, source, files=twin.files, stamp=stamp, again=read, store=store, archive=made)
 
 
 def recorded_twin(recorded: Recorded) -> Twin:

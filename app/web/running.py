@@ -15,8 +15,6 @@ from ..live.jobs import run_all
 from ..live.runs.refits import Refits
 from ..live.store import StoreWriter, open_store
 from ..outputs import Publisher
-from ..outputs.archive import Archive
-from ..outputs.parts import ArchivePlan
 from ..terminal import complain, print_line
 from ..views.recording.rrd_file import NEVER, Split
 from ..views.recording.writer import ALL_STRETCHES, Recorder
@@ -59,7 +57,7 @@ class OpenedTwin:
     its session, `annotations` its notes of users, `remarks` new notices, (level, text). `files` are the twin's files,
     `stamp` their state when read, and `again` reads them once more; a recording has none. `workshop` compiles its
     filters, and stops with the engine. `store` is the file from which it continues after a restart,
-    `archive` where its rows are archived.
+    `archive` makes the archive of its rows.
     """
 
     twin: Twin
@@ -75,7 +73,7 @@ class OpenedTwin:
     again: Callable[[], Twin] | None = None
     workshop: Workshop | None = None
     store: Path | None = None
-    archive: ArchivePlan | None = None
+    archive: Callable[..., Any] | None = None
 
 
 class RunningTwin:
@@ -124,7 +122,7 @@ class RunningTwin:
             raise
         self.store = None if store is None else StoreWriter(self.engine, store, stored)
         self.engine.store = self.store
-        self.archive = None if opening.archive is None else Archive(self.engine, opening.archive, stored)
+        self.archive = None if opening.archive is None else opening.archive(self.engine, stored)
         if opening.said:
             self.engine.notices.restore(list(opening.said))
         if stored is None:

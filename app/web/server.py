@@ -20,6 +20,7 @@ from starlette.routing import BaseRoute, Mount, Route, WebSocketRoute
 from starlette.staticfiles import StaticFiles
 from starlette.websockets import WebSocket
 
+from config.extensions import hooks
 from estimators.errors import ConfigError, NisusError
 
 from ..live.engine import STATUS_PERIOD_S
@@ -41,7 +42,6 @@ from .commands_json import command_from_json, commands_schema
 from .door import Door
 from .fit_api import FitApi
 from .http import PAGE, OneAtATime, get, openapi, page_file, post
-from .metrics import metrics
 from .request_threads import in_rerun_thread, in_thread
 from .runs_api import RunsApi
 from .streams import PageStream, feed_rerun
@@ -157,7 +157,6 @@ class PageServer:
             get("/alarms", self._alarms),
             get("/readyz", self._ready),
             get("/api/status", self._status),
-            get("/metrics", self._metrics),
             get("/api/state", self._state, answer=StateMessage),
             get("/api/state/schema.json", state_schema),
             get("/api/openapi.json", self._openapi),
@@ -173,6 +172,7 @@ class PageServer:
             *readings.routes(self._engine),
             *self._runs.routes(),
             *self._fit.routes(),
+            *(route for routes in hooks("routes") for route in routes(self._engine)),
             post("/api/command", self._command, status=202, body_schema=commands_schema),
             get("/api/forecast", self._forecasts.may, refused=409),
             post("/api/forecast", self._forecast, run=OneAtATime("forecast")),
@@ -318,10 +318,6 @@ class PageServer:
         if status.t is None:
             return PlainTextResponse("no measurement has arrived\n", 503)
         return PlainTextResponse("ok\n")
-
-    def _metrics(self, states: bool = False) -> Response:
-        """Answer with metrics for Prometheus; `states` adds a series per state."""
-        return metrics(self._engine, states)
 
     def _state(self, covariance: bool = False) -> Response:
         """Answer with the present state (see docs/http-api.md)."""

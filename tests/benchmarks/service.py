@@ -18,7 +18,7 @@ from pathlib import Path
 import numpy as np
 
 from tests import ROOT
-from tests.app.web.test_service import Served, all_run
+from tests.extensions.service.test_service import Served, all_run
 
 RATE_HZ, MIN_SHARE = 10.0, 0.9
 KILL_PERIOD_S = 60.0

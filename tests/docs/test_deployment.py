@@ -19,7 +19,7 @@ from app.cli.arguments import ServeCommand
 from app.cli.main import parse
 from app.cli.options import environment_options
 from tests import ROOT
-from tests.app.web.test_service import Served, all_run
+from tests.extensions.service.test_service import Served, all_run
 from tests.skips import program
 from tests.support import free_port
 from tests.waiting import LIMIT_S, wait_for

@@ -3,6 +3,6 @@
 from config.extensions import Extension, Part
 
 EXTENSION = Extension(
-    needs=("mqtt",),
+    needs=("archive", "mqtt", "service"),
     commands={"fleet": Part(f"{__name__}.arguments:FleetCommand", f"{__name__}.command:run_fleet")},
 )

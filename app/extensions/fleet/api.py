@@ -11,9 +11,9 @@ import numpy as np
 from starlette.responses import Response
 from starlette.routing import BaseRoute
 
+from app.extensions.service.metrics import exposed
 from app.web import readings
 from app.web.http import get, page_file
-from app.web.metrics import exposed
 from estimators.errors import ConfigError, nearest
 from estimators.fleet.siblings import Siblings
 from estimators.fleet.table import FleetTable

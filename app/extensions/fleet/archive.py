@@ -17,13 +17,14 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from app.extensions.archive.parts import DAY_NS, ArchivePlan, number_of, parts_of, remove_surplus
 from app.live.jobs import LoopThread
-from app.outputs.archive_journal import JOURNAL, Journal, complete_journal, complete_journals, read_journal
-from app.outputs.parts import DAY_NS, ArchivePlan, number_of, parts_of, remove_surplus
 from estimators.errors import SourceError
 from estimators.events.batch import KIND_NAMES, READING, Events
 from sources.source import Report
 from sources.worker_process import gist
+
+from .journal import JOURNAL, Journal, complete_journal, complete_journals, read_journal
 
 if TYPE_CHECKING:
     from estimators.model.state_space import StateSpaceModel

@@ -8,7 +8,8 @@ from typing import Annotated
 
 import tyro
 
-from app.cli.arguments import ArchiveOptions, EstimatorOption, Flag, JsonOption, ServiceOptions, TuningOption
+from app.cli.arguments import ArchiveOptions, EstimatorOption, Flag, JsonOption, TuningOption
+from app.extensions.service.arguments import ServiceOptions
 
 
 @dataclass(frozen=True)

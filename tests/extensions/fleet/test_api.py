@@ -14,11 +14,11 @@ import numpy as np
 import pytest
 from playwright.sync_api import expect
 
+from app.extensions.archive.parts import parts_of
 from app.extensions.fleet.api import FleetApi, id_of
 from app.extensions.fleet.archive import AssetHistory
 from app.extensions.fleet.plan import load_fleet
 from app.extensions.fleet.running import RunningFleet
-from app.outputs.parts import parts_of
 from estimators.errors import ConfigError
 from estimators.fleet.siblings import siblings
 from estimators.track import HEALTH_NAMES

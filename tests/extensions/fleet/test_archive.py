@@ -7,17 +7,17 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 import pytest
 
+from app.extensions.archive.parts import ArchivePlan, parts_of
 from app.extensions.fleet import archive as archives
 from app.extensions.fleet import running as live
 from app.extensions.fleet.archive import AssetHistory, FleetArchive
 from app.extensions.fleet.plan import load_fleet
 from app.extensions.fleet.running import RunningFleet
-from app.outputs.parts import ArchivePlan, parts_of
 from app.twin.twin import load_twin
 from app.views.recording.rrd_file import Split, parse_split
 from app.web.readings import messages_of
 from estimators.log import Log
-from tests.app.outputs.written_archive import BEGIN, SECOND, SPLIT, Written
+from tests.extensions.fleet.written_archive import BEGIN, SECOND, SPLIT, Written
 
 DAY_S = 86_400
 MODEL = load_twin("motor_can").model
@@ -172,7 +172,7 @@ def test_files_end_with_the_day_and_with_their_size(tmp_path):
 
 
 def test_the_rows_of_an_asset_are_in_one_or_two_groups_of_a_file_and_old_files_are_left(tmp_path, monkeypatch):
-    monkeypatch.setattr("app.outputs.parts.GROUP_ROWS", 100)
+    monkeypatch.setattr("app.extensions.archive.parts.GROUP_ROWS", 100)
     written = Written(tmp_path, Split(size=30_000.0))
     for k in range(0, 3000, 500):
         written.put(k, 500)

@@ -15,7 +15,7 @@ from tests import ROOT
 from tests.app.scripted import pull_all
 from tests.app.web.gallery.opened import opened
 from tests.app.web.page.browsed import drawn, until
-from tests.app.web.test_service import Served
+from tests.extensions.service.test_service import Served
 from tests.waiting import wait_for
 
 pytestmark = pytest.mark.browser

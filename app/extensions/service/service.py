@@ -20,16 +20,16 @@ from starlette.routing import BaseRoute, Mount, Route, WebSocketRoute
 from starlette.staticfiles import StaticFiles
 from starlette.websockets import WebSocket
 
+from app.terminal import print_line
+from app.web.door import Door
+from app.web.gate import USER, User
+from app.web.http import PAGE, get, page_file, post, refusal
+from app.web.request_threads import in_thread
+from app.web.viser_proxy import couple
 from estimators.errors import ConfigError, is_blank, nearest, quoted
 
-from ..terminal import print_line
-from .door import Door
 from .forward import Forwarded, credentials
-from .gate import USER, User
-from .http import PAGE, get, page_file, post, refusal
-from .request_threads import in_thread
 from .supervisor import FAILED, FIRST_RETRY_S, RUNNING, STARTING, STOPPED, ServedTwin, Supervisor
-from .viser_proxy import couple
 
 BLANK = "a twin has the name of its file, which is blank; rename it"
 """Rule of a file whose name cannot be seen."""

@@ -9,9 +9,8 @@ from contextlib import suppress
 from pathlib import Path
 from typing import Any
 
+from app.extensions.archive.parts import DAY_NS, Part, lock, number_of, parts_of
 from estimators.errors import SourceError
-
-from .parts import DAY_NS, Part, lock, number_of, parts_of
 
 JOURNAL = ".arrows"
 """Ending of a journal: a stream of Arrow batches, named by the number of its Parquet file."""

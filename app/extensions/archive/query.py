@@ -6,13 +6,13 @@ import sys
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from app.present.result import Topic, to_json, to_text
 from estimators.errors import ConfigError, nearest
 
-from ..outputs.parts import parts_of
-from ..present.result import Topic, to_json, to_text
+from .parts import parts_of
 
 if TYPE_CHECKING:
-    from .arguments import QueryCommand
+    from app.cli.arguments import QueryCommand
 
 ALL = "archive"
 """View with the rows of all twins."""

@@ -4,9 +4,9 @@ import numpy as np
 import pyarrow as pa
 import pyarrow.parquet as pq
 
+from app.extensions.archive.parts import ArchivePlan, parts_of
 from app.extensions.fleet.archive import FleetArchive
-from app.outputs.archive_journal import read_journal
-from app.outputs.parts import ArchivePlan, parts_of
+from app.extensions.fleet.journal import read_journal
 from app.twin.twin import load_twin
 from app.views.recording.rrd_file import parse_split
 from estimators.log import READING, Events

@@ -17,21 +17,21 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple
 from urllib.parse import quote
 
+from app.terminal import until_asked_to_end, use_lines_of_json, when_asked_to_end
+from app.views.recording.rrd_file import NEVER, Split, parse_split
+from app.web.door import LOOPBACK, Door, check_port
+from app.web.gate import NEEDS_TOKENS, Grant, grants_of
 from config.loader import shipped
 from estimators.errors import ConfigError, NisusError, is_blank, quoted
 
-from ..terminal import until_asked_to_end, use_lines_of_json, when_asked_to_end
-from ..views.recording.rrd_file import NEVER, Split, parse_split
-from ..web.door import LOOPBACK, Door, check_port
-from ..web.gate import NEEDS_TOKENS, Grant, grants_of
-from ..web.service import BLANK, Service, TwinFolder
-from ..web.supervisor import STATUS_PERIOD_S, Supervisor, forget_safe_path
+from .service import BLANK, Service, TwinFolder
+from .supervisor import STATUS_PERIOD_S, Supervisor, forget_safe_path
 
 if TYPE_CHECKING:
-    from ..web.session import Session
-    from .arguments import ServeCommand, ServiceOptions
+    from app.cli.arguments import ServeCommand, ServiceOptions
+    from app.web.session import Session
 
-PRELOADED = ("app.cli.preloaded",)
+PRELOADED = ("app.extensions.service.preloaded",)
 """Modules that the processes of the twins share: they are imported once."""
 
 
@@ -190,10 +190,10 @@ def _take(pipe: Connection, session: Session, done: threading.Event) -> None:
 def _opened(options: TwinPlaces, name: str, path: str) -> tuple[Session, Mapping[str, Any]]:
     from dataclasses import asdict
 
-    from ..web.gallery.cards import card_of
-    from ..web.gallery.gallery import StartRequest
-    from ..web.session import Page
-    from .open_twin import FileOpener, open_session, opened_twin
+    from app.cli.open_twin import FileOpener, open_session, opened_twin
+    from app.web.gallery.cards import card_of
+    from app.web.gallery.gallery import StartRequest
+    from app.web.session import Page
 
     store = None if options.store is None else options.store / f"{name}.store"
     read = partial(opened_twin, path, store=store, archive=options.archive, split=options.split)

@@ -10,10 +10,9 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
+from app.views.recording.rrd_file import Disk, Split
 from estimators.errors import SourceError
 from sources.source import Report
-
-from ..views.recording.rrd_file import Disk, Split
 
 GROUP_ROWS = 8192
 """Rows that are written at once; fewer only at the end of a file."""

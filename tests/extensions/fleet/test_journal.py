@@ -2,10 +2,10 @@
 
 from itertools import pairwise
 
+from app.extensions.archive.parts import parts_of
+from app.extensions.fleet import journal as archive_journal
 from app.extensions.fleet.archive import AssetHistory
-from app.outputs import archive_journal
-from app.outputs.parts import parts_of
-from tests.app.outputs.written_archive import Written
+from tests.extensions.fleet.written_archive import Written
 
 
 def test_a_journal_of_a_killed_process_is_completed_up_to_its_last_whole_batch(tmp_path):

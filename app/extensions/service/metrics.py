@@ -7,13 +7,13 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from starlette.responses import Response
+from starlette.routing import BaseRoute
 
+from app.live.running_fold import Running
+from app.present.state_message import state_message
+from app.web.http import get, refusal
 from estimators.errors import ConfigError
 from estimators.track import HEALTH_NAMES, VERDICT_NAMES
-
-from ..live.running_fold import Running
-from ..present.state_message import state_message
-from .http import refusal
 
 if TYPE_CHECKING:
     from prometheus_client.core import Metric
@@ -103,13 +103,18 @@ class TwinCollector:
         yield from (alerts, waiting)
 
 
-def metrics(engine: Running, states: bool = False) -> Response:
-    """Answer with the metrics of a twin and of this process, in Prometheus's text format; 501 without its package."""
-    return exposed(TwinCollector(engine, states=states))
+def routes(engine: Running) -> list[BaseRoute]:
+    """Return the route of the metrics of a running twin."""
+
+    def metrics(states: bool = False) -> Response:
+        """Answer with metrics for Prometheus; `states` adds a series per state."""
+        return exposed(TwinCollector(engine, states=states))
+
+    return [get("/metrics", metrics)]
 
 
 def exposed(collector: Any) -> Response:
-    """Answer with the metrics of a collector and of this process, as `metrics`."""
+    """Answer with metrics, also of this process, in Prometheus's text format; 501 without its package."""
     try:
         from prometheus_client import CONTENT_TYPE_LATEST, CollectorRegistry, ProcessCollector, generate_latest
     except ModuleNotFoundError:

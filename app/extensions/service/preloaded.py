@@ -15,16 +15,17 @@ import uvicorn.loops.auto
 import uvicorn.protocols.websockets.auto  # noqa: F401
 from numba.core.registry import cpu_target
 
+from app.cli import open_twin
+from app.views.rerun import rows
+from app.views.viser import view
+from app.web import server
 from config.schema import TwinSection
 from sources import pacer
 from sources.tables import table
 
-from ..views.rerun import rows
-from ..views.viser import view
-from ..web import server
-from . import open_twin, serve
+from . import command
 
-__all__ = ["open_twin", "pacer", "rows", "serve", "server", "table", "view"]
+__all__ = ["command", "open_twin", "pacer", "rows", "server", "table", "view"]
 
 cpu_target.typing_context.refresh()
 cpu_target.target_context.refresh()

@@ -14,17 +14,20 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from app.live.history_copy import last_written
+from app.live.jobs import LoopThread
+from app.live.outputs import Pull
 from estimators.events.batch import MAINTENANCE
 from estimators.interface.table import table_of
 from sources.worker_process import gist
 
-from ..live.history_copy import last_written
-from ..live.jobs import LoopThread
-from ..live.outputs import Pull
 from .parts import DAY_NS, GROUP_ROWS, ArchivePlan, Part, parts_of, remove_surplus
 
 if TYPE_CHECKING:
-    from ..live.running_fold import Running, StoredTwin
+    from pathlib import Path
+
+    from app.live.running_fold import Running, StoredTwin
+    from app.views.recording.rrd_file import Split
 
 PERIOD_S, IDLE_PERIOD_S = 0.05, 1.0
 """Seconds between two looks for rows, at least and, while there are none, at most."""
@@ -213,3 +216,8 @@ class _Versions:
         begun = bool(rows.size) and int(events.t[rows[0]]) in times
         self._changes += [(first + int(k), int(events.t[k])) for k in rows]
         return self._first + len(times) - begun
+
+
+def archive_of(folder: Path, split: Split, engine: Running, stored: StoredTwin | None) -> Archive:
+    """Return the archive of a running twin; `folder` is that of its own."""
+    return Archive(engine, ArchivePlan(folder, split), stored)

@@ -5,6 +5,7 @@ import math
 import os
 import sys
 import time
+from functools import partial
 
 import numpy as np
 import pyarrow as pa
@@ -13,9 +14,10 @@ import pytest
 
 from app.cli.main import main
 from app.cli.open_twin import live_source
+from app.extensions.archive import parts as archives
+from app.extensions.archive.parts import parts_of
+from app.extensions.archive.writer import archive_of
 from app.live.commands import SetTuning
-from app.outputs import parts as archives
-from app.outputs.parts import ArchivePlan, parts_of
 from app.twin.twin import load_twin
 from app.views.recording.rrd_file import Split, parse_split
 from app.web.running import OpenedTwin, RunningTwin
@@ -34,7 +36,7 @@ class Session:
         self.twin = twin or load_twin("motor_winding", overrides={"history": "2048"})
         self.source = source or Scripted(live=True)
         make = self.source if callable(self.source) else lambda report: self.source
-        opened = OpenedTwin(self.twin, make, archive=ArchivePlan(folder / "winding", split), store=store)
+        opened = OpenedTwin(self.twin, make, archive=partial(archive_of, folder / "winding", split), store=store)
         self.running = RunningTwin(opened, door=None)
         self.engine, self.archive = self.running.engine, self.running.archive
         self.engine.settle()

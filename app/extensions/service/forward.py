@@ -11,7 +11,8 @@ import h11
 from starlette.responses import PlainTextResponse, Response
 from starlette.types import Receive, Scope, Send
 
-from .gate import USER, User
+from app.web.gate import USER, User
+
 from .supervisor import ServedTwin
 
 PIECE_BYTES = 65_536

@@ -14,10 +14,9 @@ from multiprocessing import forkserver
 from multiprocessing.connection import Connection, wait
 from typing import Any
 
+from app.live.jobs import LoopThread
+from app.terminal import print_line
 from estimators.track import HEALTH_NAMES
-
-from ..live.jobs import LoopThread
-from ..terminal import print_line
 
 STARTING, RUNNING, STOPPED, FAILED = "starting", "running", "stopped", "failed"
 """States of a twin's process."""
