@@ -1,1 +1,0 @@
-"""Learned corrections of a model: training data from recordings, training, and judging; see model/correction.py."""
