@@ -8,28 +8,28 @@ from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+from app.cli.options import check_output, names_of, overrides_of
+from app.cli.prepare import attend, prepare
+from app.present.result import to_json, to_text
+from app.terminal import complain
+from app.twin.learned import run_net
+from app.twin.log_reader import read_log
+from app.twin.model import physics_of
+from app.twin.twin import Twin, load_twin
 from config.yaml_files import shown_path, writing
 from estimators.errors import ConfigError
 from estimators.fit.entries import Setting
 from estimators.fit.judge import PartScore, worths
 from estimators.fit.recording import Recording, held_out_rows
-from estimators.learned.train import NET, Trained, against, on_windows, train
-from estimators.learned.windows import Windows, known_states, windows
 from estimators.model.hybrid import check_places
 from estimators.model.state_space import StateSpaceModel
 from estimators.registry import find_estimator
 from estimators.smoothing.smooth import check_smooth
 from estimators.tuning import Tuning
 
-from ..present.result import to_json, to_text
-from ..studies.learn import Lesson, as_dict, correction_text, noises_of, scores_of, sections
-from ..terminal import complain
-from ..twin.learned import run_net
-from ..twin.log_reader import read_log
-from ..twin.model import physics_of
-from ..twin.twin import Twin, load_twin
-from .options import check_output, names_of, overrides_of
-from .prepare import attend, prepare
+from .lesson import Lesson, as_dict, correction_text, noises_of, scores_of, sections
+from .train import NET, Trained, against, on_windows, train
+from .windows import Windows, known_states, windows
 
 if TYPE_CHECKING:
     from .arguments import LearnCommand as Arguments

@@ -19,9 +19,10 @@ from typing import NamedTuple
 
 import numpy as np
 
-from ..errors import EstimatorError
-from ..fit.judge import MIN_SIGMAS, PartScore, gain, narrower, worse
-from ..model.correction import Correction, GaussianProcess, Net, Ridge
+from estimators.errors import EstimatorError
+from estimators.fit.judge import MIN_SIGMAS, PartScore, gain, narrower, worse
+from estimators.model.correction import Correction, GaussianProcess, Net, Ridge
+
 from .windows import Windows
 
 GP, RIDGE, NET = KINDS = ("gp", "ridge", "net")

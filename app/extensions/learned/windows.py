@@ -14,14 +14,14 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from ..compiled.context import steps_of
-from ..compiled.model import compile_model
-from ..fold import Fold
-from ..log import INPUT, READING, RESET, Log, truth_of
-from ..model.hybrid import gathered, places
-from ..model.state_space import StateSpaceModel
-from ..numerics.linalg import wrapped
-from ..smoothing.smooth import smooth
+from estimators.compiled.context import steps_of
+from estimators.compiled.model import compile_model
+from estimators.fold import Fold
+from estimators.log import INPUT, READING, RESET, Log, truth_of
+from estimators.model.hybrid import gathered, places
+from estimators.model.state_space import StateSpaceModel
+from estimators.numerics.linalg import wrapped
+from estimators.smoothing.smooth import smooth
 
 MIN_LENGTH_SHARE = 0.5  # Shortest window, as a share of the length; the inverse is the longest
 RATE_STEP = 1e-3  # Step of the derivative with respect to a rate, in prior standard deviations of its state

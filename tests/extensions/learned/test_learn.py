@@ -1,19 +1,16 @@
 """`nisus learn`: a body in a shell whose heating the model leaves out; what is kept, what is refused, what is said."""
 
-import sys
-
 import numpy as np
 import pytest
 import yaml
 
-from app.twin.learned import run_net
 from app.twin.log_reader import read_log
 from app.twin.twin import load_twin
 from estimators.diagnostics.score import score
-from estimators.errors import ConfigError
 from estimators.log import TRUTH
+from tests.app.twin.test_learned import net_file
 from tests.cases import cases
-from tests.support import error_of, folded
+from tests.support import folded
 
 MODEL = """\
 from estimators.model import Input, Noise, Row, Sensor, State, StateSpaceModel
@@ -131,35 +128,6 @@ def test_json_has_all_of_it(heated, nisus):
     assert windows["drift"]["corrected"] < 0.5 * windows["drift"]["physics"]
 
 
-def net_file(path, weights, *, kind="DOUBLE"):
-    onnx = pytest.importorskip("onnx")
-    pytest.importorskip("onnxruntime")
-    helper, kinds = onnx.helper, onnx.TensorProto
-    weights = np.asarray(weights)
-    element = getattr(kinds, kind)
-    graph = helper.make_graph(
-        [helper.make_node("MatMul", ["z", "w"], ["m"])],
-        "line",
-        [helper.make_tensor_value_info("z", element, [None, weights.shape[0]])],
-        [helper.make_tensor_value_info("m", element, [None, weights.shape[1]])],
-        [helper.make_tensor("w", element, weights.shape, weights.ravel())],
-    )
-    model = helper.make_model(graph, opset_imports=[helper.make_opsetid("", 17)])
-    model.ir_version = 8
-    onnx.save(model, str(path))
-    return path
-
-
-@pytest.mark.parametrize("kind", ["DOUBLE", "FLOAT"])
-def test_a_net_says_the_same_alone_and_among_others(tmp_path, kind):
-    weights = np.array([[0.5, -1.0], [2.0, 0.25], [0.0, 3.0]])
-    run = run_net(net_file(tmp_path / "net.onnx", weights, kind=kind), 3, 2)
-    z = np.random.default_rng(0).normal(0.0, 2.0, (7, 3))
-    found = run(z)
-    np.testing.assert_allclose(found, z @ weights, rtol=0.0, atol=1e-12 if kind == "DOUBLE" else 1e-5)
-    np.testing.assert_array_equal(found, np.concatenate([run(row[None]) for row in z]))
-
-
 def test_a_net_is_judged_kept_and_folded(heated, nisus):
     # A line in the load for what is a parabola: 0.4 load² of loads up to 2.
     net = net_file(heated.with_name("net.onnx"), [[0.6]], kind="FLOAT")
@@ -177,22 +145,3 @@ def test_a_net_is_judged_kept_and_folded(heated, nisus):
 @cases(__file__, "refused_learn.csv")
 def test_wrong_arguments_are_one_line(heated, nisus, arguments, said):
     assert said in nisus.refuses("learn", heated, *LEARN, "--kind", "ridge", *arguments.split())
-
-
-def test_without_onnxruntime_a_line_says_what_to_install(tmp_path, monkeypatch):
-    monkeypatch.setitem(sys.modules, "onnxruntime", None)
-    with pytest.raises(ConfigError, match=r"needs onnxruntime, which is not installed: pip install 'nisus\[learned\]'"):
-        run_net(tmp_path / "net.onnx", 1, 1)
-
-
-def test_a_file_that_is_no_such_net_is_one_line(tmp_path):
-    net = net_file(tmp_path / "net.onnx", np.ones((3, 2)))
-    with pytest.raises(ConfigError, match="it does not take 2 features"):
-        run_net(net, 2, 2)
-    with pytest.raises(ConfigError, match="it gives 2 numbers; it must give one for each of 1 corrected"):
-        run_net(net, 3, 1)
-    net.write_bytes(b"no net")
-    assert "cannot be read as an ONNX network" in error_of(ConfigError, run_net, net, 3, 2)
-    net.unlink()
-    with pytest.raises(ConfigError, match="there is no such file"):
-        run_net(net, 3, 2)

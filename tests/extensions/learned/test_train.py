@@ -5,9 +5,9 @@ import sys
 import numpy as np
 import pytest
 
+from app.extensions.learned.train import GP, NET, RIDGE, drift, train
+from app.extensions.learned.windows import Windows, known_states, windows
 from estimators.errors import EstimatorError
-from estimators.learned.train import GP, NET, RIDGE, drift, train
-from estimators.learned.windows import Windows, known_states, windows
 from estimators.log import Log
 from estimators.model.state_space import Input, Noise, Parameter, Row, Sensor, State, StateSpaceModel
 from tests.models import first_state
