@@ -20,13 +20,13 @@ from ..live.tunings.versions import (
     Settings,
     accept,
     apply_tuning,
+    badness,
     figures,
     keep,
     listing,
     version_text,
 )
 from ..present.result import TableColumn, Topic, to_json, to_text
-from ..studies.baseline import badness
 from ..studies.scores import pictures_of
 from ..twin.log_reader import read_log
 from ..twin.twin import load_twin

@@ -1,1 +1,1 @@
-"""Studies over a log: advice, analysis, stress, guard."""
+"""Studies over a log: advice, analysis, comparison, fits."""

@@ -22,7 +22,7 @@ from ..live.running_fold import Running
 from ..live.runs.scores import RunScores
 from ..live.runs.sweep import Sweeps, noise
 from ..live.tunings.tuning_yaml import tuning_yaml
-from ..live.tunings.versions import Settings, figures, keep, listing, load_into, version_text
+from ..live.tunings.versions import Settings, figures, keep, listing, load_into, verdicts, version_text
 from ..present.export.report import Reported, report
 from ..present.export.track_file import KINDS, encoded, rows_of_run, tables
 from ..present.result import to_html
@@ -30,7 +30,6 @@ from ..present.runs_json import changes_json, noise_json, runs_json, swept_json,
 from ..present.series.chart_stream import Seconds
 from ..present.series.series import Series
 from ..studies.commission import commission_running
-from ..studies.guard import last
 from ..twin.twin import with_version
 from .http import OneAtATime, get, post
 
@@ -103,7 +102,7 @@ class RunsApi:
     def _tunings(self) -> Any:
         """List the tuning versions."""
         twin = self._engine.twin
-        return {"running": self._engine.status().tuning.name, "versions": listing(twin), "guard": last(twin.path)}
+        return {"running": self._engine.status().tuning.name, "versions": listing(twin), "guard": verdicts(twin.path)}
 
     def _keep(self, run: int, name: str, note: str) -> Any:
         """Keep a run as a version, with its scores."""

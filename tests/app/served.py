@@ -5,20 +5,41 @@ import io
 import json
 import socket
 import threading
+from pathlib import Path
+from typing import Any
 from urllib.parse import parse_qs, urlsplit
 
 from websockets.sync.client import connect
 from websockets.sync.server import serve
 
 from app.live.engine import Engine
+from app.live.tunings.versions import VERDICT_FILE
 from app.views.viser.guarded_server import HEADER
 from app.views.viser.stage import Choice, Choices
 from app.web.server import PageServer
+from config.tunings import folders
 from tests.app.scripted import Scripted
 from tests.app.scripted import twin as scripted_twin
 from tests.waiting import LIMIT_S, wait_for
 
 SECRET = "the secret between the servers"
+
+VERDICT = {
+    "recording": "winding",
+    "at": "2026-11-22T10:30:00Z",
+    "version": "own",
+    "figures": 1,
+    "worse": ["rmse.temperature was 0.5 and is 0.6: worse by 0.1, allowed 0.01"],
+    "better": [],
+    "failure": "",
+}
+
+
+def keep_verdicts(twin: Path, *verdicts: dict[str, Any]) -> None:
+    """Write verdicts beside the versions of a twin, as `nisus guard` does."""
+    path = folders(twin)[0] / VERDICT_FILE
+    path.parent.mkdir(parents=True, exist_ok=True)
+    path.write_text(json.dumps({"recordings": verdicts}))
 
 
 class FakeViser:

@@ -23,9 +23,9 @@ from pathlib import Path
 
 import numpy as np
 
+from app.extensions.lab.stress.scenario import Bench
 from app.live.tunings.versions import Settings, version_text
 from app.present.export.calibration_lines import health_shares
-from app.studies.stress.scenario import Bench
 from app.twin.defaults import bounds_of, natural_aim, width_priors
 from app.twin.log_reader import read_log
 from app.twin.twin import Twin, load_twin, with_held

@@ -17,7 +17,7 @@ from typing import Any
 import numpy as np
 from numba.extending import register_jitable
 
-from app.studies.stress.scenario import plain_log
+from app.extensions.lab.stress.scenario import plain_log
 from app.twin.log_reader import read_log
 from app.twin.twin import load_twin
 from estimators import fold_kernel

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import time
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
@@ -14,6 +15,7 @@ from config.companion_schema import AcceptedSection, EvidenceSection, MovedSecti
 from config.loader import moved
 from config.tunings import OWN_VALUES, Version, check_name, folders, load_version, version_files, version_of
 from config.yaml_files import as_section, rewrite, rounded, shown_path, with_section, writing
+from estimators.diagnostics.health import PROBABILITY
 from estimators.diagnostics.score import Score
 from estimators.errors import LARGEST, ConfigError
 from estimators.registry import find_estimator
@@ -30,6 +32,8 @@ if TYPE_CHECKING:
     from estimators.fit.uncertainty import ParameterWidths
 
 NIS, LIKELIHOOD, RMSE, COVERAGE, REFUSED = "nis", "log_likelihood", "rmse", "coverage", "refused"
+
+VERDICT_FILE = "guard.json"  # name of the file with the last verdicts, in the folder of the tuning versions
 
 DIGITS = 8
 """Significant digits of a score, more than differ between processors."""
@@ -107,6 +111,22 @@ def figures(found: Score) -> dict[str, float]:
         **_fits(fits, "rmse"),
     }
     return _finite(known)
+
+
+def badness(name: str, value: float) -> float:
+    """Return how bad a figure is; more is worse.
+
+    The logarithm of an RMSE, the distance of the logarithm of the NIS from 0 and of a coverage from 95 %; the
+    likelihood negated, others as they are. A change of 0.05 is 5 % of an RMSE, 5 % of the NIS, 5 of 100 errors, 5 % of
+    the density of a measurement.
+    """
+    kind = name.partition(".")[0]
+    if kind in (RMSE, NIS):
+        size = float(np.log(max(value, np.finfo(float).tiny)))
+        return size if kind == RMSE else abs(size)
+    if kind == COVERAGE:
+        return abs(value - PROBABILITY)
+    return -value if kind == LIKELIHOOD else value
 
 
 def _finite(known: Mapping[str, float]) -> dict[str, float]:
@@ -210,6 +230,19 @@ def accept(version: Version, note: str) -> None:
 def now() -> str:
     """Return the present time in the format of versions."""
     return time.strftime("%Y-%m-%dT%H:%M:%SZ", time.gmtime())
+
+
+def verdicts(twin: Path) -> list[dict[str, Any]]:
+    """Return the last verdict of `nisus guard` on each recording, newest first; none if the file is damaged or missing.
+
+    Each has `recording`, `at` (UTC), `version` (tuning), `figures` (number), `worse` and `better` (a line each) and
+    `failure`, empty unless it could not be folded.
+    """
+    try:
+        found = json.loads((folders(twin)[0] / VERDICT_FILE).read_text(encoding="utf-8"))["recordings"]
+        return sorted(found, key=lambda each: (each["at"], each["recording"]), reverse=True)
+    except (OSError, ValueError, KeyError, TypeError):
+        return []
 
 
 def _header(head: VersionSection) -> str:

@@ -8,12 +8,11 @@ import pytest
 import yaml
 
 from app.live.commands import SetTuning
-from app.studies.baseline import ComparedFigure
-from app.studies.guard import GuardVerdict, keep_last
 from app.twin.twin import load_twin
 from config.loader import TWINS
 from estimators.tuning import Tuning
 from tests.app.scripted import MODEL
+from tests.app.served import VERDICT, keep_verdicts
 from tests.cases import cases
 from tests.support import folded
 from tests.waiting import wait_for
@@ -117,11 +116,9 @@ def tunings(twin_page):
 
 def test_what_guard_said_last_is_listed_beside_the_versions(twin_page):
     assert tunings(twin_page)["guard"] == []
-    worse = ComparedFigure("rmse.temperature", 0.5, 0.6, 0.1, 0.01)
-    keep_last(twin_page.engine.twin.path, [GuardVerdict("winding", "own", [worse])])
-    (said,) = tunings(twin_page)["guard"]
-    assert said["recording"] == "winding" and said["figures"] == 1
-    assert said["worse"] == ["rmse.temperature was 0.5 and is 0.6: worse by 0.1, allowed 0.01"]
+    newer = VERDICT | {"recording": "drive", "at": "2026-11-23T10:30:00Z"}
+    keep_verdicts(twin_page.engine.twin.path, VERDICT, newer)
+    assert tunings(twin_page)["guard"] == [newer, VERDICT]
 
 
 def turn(twin_page, key, value):

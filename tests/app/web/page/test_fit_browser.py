@@ -6,9 +6,8 @@ import re
 import pytest
 
 from app.live.tunings.versions import listing
-from app.studies.baseline import ComparedFigure
-from app.studies.guard import GuardVerdict, keep_last
 from app.twin.twin import with_version
+from tests.app.served import VERDICT, keep_verdicts
 from tests.app.web.page.browsed import running, settled
 from tests.waiting import LIMIT_S, wait_for
 
@@ -129,9 +128,7 @@ def test_single_entries_are_fitted_alone(page, session):
 
 def test_what_runs_is_kept_compared_and_loaded_again(page, session):
     engine = session.engine
-    keep_last(
-        engine.twin.path, [GuardVerdict("winding", "own", [ComparedFigure("rmse.temperature", 0.5, 0.6, 0.1, 0.01)])]
-    )
+    keep_verdicts(engine.twin.path, VERDICT)
     page.get_by_role("tab", name="Runs").click()
     guarded = page.locator('.versions [data-guarded="winding"]')
     wait_for(lambda: "1 of 1 figures worse: rmse.temperature was 0.5 and is 0.6" in guarded.inner_text())

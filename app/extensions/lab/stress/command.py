@@ -4,19 +4,19 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING
 
+from app.cli.options import overrides_of
+from app.cli.prepare import opened, prepare, progress
+from app.present.result import to_json, to_text
+from app.terminal import complain
 from estimators.errors import ConfigError
 from estimators.registry import find_estimator
 
-from ..present.result import to_json, to_text
-from ..studies.stress.detection import Trial
-from ..studies.stress.results import stress_topics
-from ..studies.stress.trials import Trials, all_trials
-from ..terminal import complain
-from .options import overrides_of
-from .prepare import opened, prepare, progress
+from .detection import Trial
+from .results import stress_topics
+from .trials import Trials, all_trials
 
 if TYPE_CHECKING:
-    from .arguments import StressCommand as Arguments
+    from ..arguments import StressCommand as Arguments
 
 
 def stress_twin(arguments: Arguments) -> int:

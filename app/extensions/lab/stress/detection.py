@@ -16,6 +16,7 @@ from typing import NamedTuple
 
 import numpy as np
 
+from app.twin.twin import Twin
 from estimators.diagnostics.detectors import OUTSIDE
 from estimators.diagnostics.episodes import episodes
 from estimators.diagnostics.score import Score, score
@@ -26,7 +27,6 @@ from estimators.fold import Fold
 from estimators.log import READING
 from estimators.numerics.linalg import wrapped
 
-from ...twin.twin import Twin
 from .scenario import (
     Bench,
     Mistake,

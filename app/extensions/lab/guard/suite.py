@@ -12,7 +12,13 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
-from config.companion_schema import AcceptedSection, FigureSection, ReferenceSection
+from app.live.tunings.versions import COVERAGE, RMSE, VERDICT_FILE, now, verdicts
+from app.present.result import Topic
+from app.studies.compare import draws, tidy, within
+from app.studies.processes import results
+from app.twin.log_reader import read_log
+from app.twin.twin import Twin, load_twin, restore_twin
+from config.companion_schema import AcceptedSection
 from config.loader import find, shipped
 from config.source_schema import SimulatorSection
 from config.tunings import OWN_VALUES, Version, accepted_version, folders, named, ships
@@ -24,10 +30,6 @@ from estimators.registry import find_entry
 from estimators.snapshots import Base
 from estimators.tuning import Tuning
 
-from ..live.tunings.versions import COVERAGE, RMSE, now
-from ..present.result import Topic
-from ..twin.log_reader import read_log
-from ..twin.twin import Twin, load_twin, restore_twin
 from .baseline import (
     ComparedFigure,
     allowances,
@@ -37,8 +39,7 @@ from .baseline import (
     read_baseline,
     write_baseline,
 )
-from .compare import draws, tidy, within
-from .processes import results
+from .schema import FigureSection, ReferenceSection
 
 SIMULATED_LOGS = 3  # logs of a simulated asset, with consecutive seeds
 
@@ -48,7 +49,6 @@ SEEDS, SEEDS_PER_LOG = 8, 4
 BUDGET_S = 15.0  # processor seconds for all folds of a recording; a shorter span of a longer one is guarded
 FIRST_SPAN_S = 10.0  # seconds of the first part of a recording that is timed
 SUFFIX = ".guard.yaml"  # end of the name of a baseline file beside a twin
-VERDICT_FILE = "guard.json"  # name of the file with the last verdict, in the folder of the tuning versions
 
 
 @dataclass(frozen=True)
@@ -94,7 +94,7 @@ def of_twin(name: str) -> GuardedLog:
     if not ships(twin):
         own = twin.with_name(f"{twin.stem}{SUFFIX}")
         return GuardedLog(twin.stem, twin, None, own, own)
-    bundled = twin.parent.parent / "guard" / f"{twin.stem}.yaml"
+    bundled = Path(__file__).with_name("baselines") / f"{twin.stem}.yaml"
     folder = folders(twin)[0]
     version = accepted_version(twin)
     if version is None or version.path.parent != folder:
@@ -119,7 +119,7 @@ def of_folder(folder: Path) -> list[GuardedLog]:
 def _of_recording(path: Path) -> GuardedLog:
     own = path.with_name(f"{path.stem}{SUFFIX}")
     try:
-        from ..views.recording.reader import read_recording
+        from app.views.recording.reader import read_recording
 
         twin = read_recording(path).twin_path
     except SourceError as error:
@@ -189,7 +189,7 @@ def twin_of(guarded: GuardedLog, overrides: dict[str, str] | None = None) -> Twi
     given = {**(overrides or {}), "tuning": OWN_VALUES if version is None else str(version.path)}
     if guarded.recording is None:
         return load_twin(guarded.twin, overrides=given)
-    from ..views.recording.reader import read_recording
+    from app.views.recording.reader import read_recording
 
     recorded = read_recording(guarded.recording)
     own = {key: value for key, value in recorded.overrides.items() if key != "tuning"}
@@ -218,7 +218,7 @@ def logs_of(guarded: GuardedLog, twin: Twin, span: float | None) -> Iterator[tup
         SourceError: If a recording is missing or cannot be read.
     """
     if guarded.recording is not None:
-        from ..views.recording.reader import read_recording
+        from app.views.recording.reader import read_recording
 
         recorded = read_recording(guarded.recording)
         yield Log.resume(twin.model, None, within(recorded.events, span)), recorded.base_for(twin.model)[0]
@@ -409,7 +409,7 @@ def keep_last(twin: Path, found: Sequence[GuardVerdict]) -> None:
     A folder that cannot be written to is ignored: the verdict itself has been printed.
     """
     path = folders(twin)[0] / VERDICT_FILE
-    saved = {each["recording"]: each for each in last(twin)}
+    saved = {each["recording"]: each for each in verdicts(twin)}
     for each in found:
         saved[each.name] = {
             "recording": each.name,
@@ -428,16 +428,3 @@ def keep_last(twin: Path, found: Sequence[GuardVerdict]) -> None:
         path.parent.mkdir(parents=True, exist_ok=True)
         other.write_text(text, encoding="utf-8")
         other.replace(path)
-
-
-def last(twin: Path) -> list[dict[str, Any]]:
-    """Return the last verdict of each recording of a twin, newest first; empty if there is none or it is damaged.
-
-    Each has `recording`, `at` (UTC), `version` (tuning), `figures` (number), `worse` and `better` (a line each) and
-    `failure`, empty unless it could not be folded.
-    """
-    try:
-        found = json.loads((folders(twin)[0] / VERDICT_FILE).read_text(encoding="utf-8"))["recordings"]
-        return sorted(found, key=lambda each: (each["at"], each["recording"]), reverse=True)
-    except (OSError, ValueError, KeyError, TypeError):
-        return []

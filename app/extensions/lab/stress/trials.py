@@ -5,10 +5,10 @@ from __future__ import annotations
 from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 
+from app.studies.processes import results
+from app.twin.twin import Twin, load_twin
 from estimators.errors import NisusError
 
-from ...twin.twin import Twin, load_twin
-from ..processes import results
 from .detection import Oracle, Trial, make
 from .matrix import matrix
 from .scenario import Bench, Mistake, asset_of

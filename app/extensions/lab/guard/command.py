@@ -5,16 +5,16 @@ from __future__ import annotations
 import os
 from typing import TYPE_CHECKING
 
+from app.cli.options import check_output, overrides_of
+from app.cli.prepare import progress
+from app.present.result import to_json, to_text
 from config.yaml_files import writing
 from estimators.errors import ConfigError, printable
 
-from ..present.result import to_json, to_text
-from ..studies.guard import chosen, guard_all, guard_json, guard_topics, junit, keep_last
-from .options import check_output, overrides_of
-from .prepare import progress
+from .suite import chosen, guard_all, guard_json, guard_topics, junit, keep_last
 
 if TYPE_CHECKING:
-    from .arguments import GuardCommand as Arguments
+    from ..arguments import GuardCommand as Arguments
 
 
 def guard(arguments: Arguments) -> int:

@@ -32,10 +32,10 @@ from typing import NamedTuple
 import numpy as np
 from scipy.special import stdtrit
 
-from config.companion_schema import FigureSection, ReferenceSection
+from app.live.tunings.versions import COVERAGE, REFUSED, badness, figures
+from app.studies.scores import pictures_of
 from config.problems import check_section
 from config.yaml_files import as_flow, read_text, rounded, writing
-from estimators.diagnostics.health import PROBABILITY
 from estimators.diagnostics.score import score
 from estimators.errors import ConfigError
 from estimators.events.batch import truth_of
@@ -43,8 +43,7 @@ from estimators.fold import Fold
 from estimators.log import Log
 from estimators.track import DIVERGED, HELD_OUT
 
-from ..live.tunings.versions import COVERAGE, LIKELIHOOD, NIS, REFUSED, RMSE, figures
-from .scores import pictures_of
+from .schema import FigureSection, ReferenceSection
 
 N_BLOCKS = 20  # blocks of a log, with equally many events
 ALLOWED_SHARE = 0.1  # part of a standard error that a figure may change by
@@ -66,22 +65,6 @@ def fold_figures(fold: Fold, rows: np.ndarray | None = None) -> dict[str, float]
     found.pop(REFUSED, None)
     found[LOST] = float(np.mean(track.health == DIVERGED)) if len(track) else 0.0
     return found
-
-
-def badness(name: str, value: float) -> float:
-    """Return how bad a figure is; more is worse.
-
-    The logarithm of an RMSE, the distance of the logarithm of the NIS from 0 and of a coverage from 95 %; the
-    likelihood negated, others as they are. A change of 0.05 is 5 % of an RMSE, 5 % of the NIS, 5 of 100 errors, 5 % of
-    the density of a measurement.
-    """
-    kind = name.partition(".")[0]
-    if kind in (RMSE, NIS):
-        size = float(np.log(max(value, np.finfo(float).tiny)))
-        return size if kind == RMSE else abs(size)
-    if kind == COVERAGE:
-        return abs(value - PROBABILITY)
-    return -value if kind == LIKELIHOOD else value
 
 
 def allowances(fold: Fold) -> dict[str, float]:

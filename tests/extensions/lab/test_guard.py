@@ -11,14 +11,22 @@ import yaml
 from scipy.stats import chi2
 
 from app.cli.arguments import FoldCommand as FoldArguments
-from app.cli.arguments import GuardCommand
 from app.cli.fold import fold_twin
-from app.cli.guard import guard
 from app.cli.main import main
-from app.live.tunings.versions import Settings, accept, keep, version_text
-from app.studies import guard as guard_study
-from app.studies.baseline import ALLOWED_SHARE, MAX_ALLOWED, allowances, compare_figures, fold_figures, read_baseline
-from app.studies.guard import last, of_twin
+from app.extensions.lab.arguments import GuardCommand
+from app.extensions.lab.guard import suite as guard_suite
+from app.extensions.lab.guard.baseline import (
+    ALLOWED_SHARE,
+    MAX_ALLOWED,
+    ComparedFigure,
+    allowances,
+    compare_figures,
+    fold_figures,
+    read_baseline,
+)
+from app.extensions.lab.guard.command import guard
+from app.extensions.lab.guard.suite import GuardVerdict, keep_last, of_twin
+from app.live.tunings.versions import Settings, accept, keep, verdicts, version_text
 from app.twin.log_reader import read_log
 from app.twin.twin import load_twin
 from config.loader import TWINS, shipped
@@ -115,19 +123,27 @@ def test_five_percent_in_one_of_ten_recordings_are_caught(archive, capsys):
 
 def test_what_was_said_last_is_kept_beside_the_versions(archive, capsys):
     path = archive / f"w{PLANTED}.yaml"
-    before = last(path)
-    assert [each["recording"] for each in before] == [path.stem] and last(archive / "none.yaml") == []
+    before = verdicts(path)
+    assert [each["recording"] for each in before] == [path.stem] and verdicts(archive / "none.yaml") == []
     # A trial with other settings says nothing of what was accepted.
-    assert guarded(None, path, set=("sensors.winding={std: 5.0}",)) == 1 and last(path) == before
+    assert guarded(None, path, set=("sensors.winding={std: 5.0}",)) == 1 and verdicts(path) == before
     kept(path, worse_by(path, 0.05))
     assert guarded(archive) == 1
-    (worse,), (fine,) = last(path), last(archive / "w0.yaml")
+    (worse,), (fine,) = verdicts(path), verdicts(archive / "w0.yaml")
     assert worse["version"] == "planted" and any(line.startswith("rmse.temperature was ") for line in worse["worse"])
     assert fine["version"] == "own" and fine["figures"] > 5 and not fine["worse"] and not fine["failure"]
     # Of one twin alone: what was said of the others stays; a file that was damaged is no obstacle.
     (archive / "w1.tunings" / "guard.json").write_text("{")
-    assert last(archive / "w1.yaml") == [] and guarded(None, archive / "w1.yaml") == 0
-    assert last(archive / "w1.yaml")[0]["recording"] == "w1" and last(path) == [worse]
+    assert verdicts(archive / "w1.yaml") == [] and guarded(None, archive / "w1.yaml") == 0
+    assert verdicts(archive / "w1.yaml")[0]["recording"] == "w1" and verdicts(path) == [worse]
+
+
+def test_a_figure_that_got_worse_is_kept_in_words(tmp_path):
+    worse = ComparedFigure("rmse.temperature", 0.5, 0.6, 0.1, 0.01)
+    keep_last(tmp_path / "winding.yaml", [GuardVerdict("winding", "own", [worse])])
+    (said,) = verdicts(tmp_path / "winding.yaml")
+    assert said["recording"] == "winding" and said["figures"] == 1
+    assert said["worse"] == ["rmse.temperature was 0.5 and is 0.6: worse by 0.1, allowed 0.01"]
 
 
 def test_reruns_are_silent(archive, capsys):
@@ -156,15 +172,15 @@ def drawn(tmp_path):
 
 def test_other_draws_are_chance_and_five_percent_are_not(drawn, monkeypatch, capsys):
     """Ten reruns with other members are silent; the same members with R scaled are not."""
-    own = guard_study._fold
+    own = guard_suite._fold
     for k in range(1, 11):
         monkeypatch.setattr(
-            guard_study,
+            guard_suite,
             "_fold",
             lambda twin, tuning, log, base, seed, k=k: own(twin, tuning, log, base, seed + 100 * k),
         )
         assert guarded(None, drawn) == 0
-    monkeypatch.setattr(guard_study, "_fold", own)
+    monkeypatch.setattr(guard_suite, "_fold", own)
     assert guarded(None, drawn) == 0
     capsys.readouterr()
     assert guarded(None, drawn, set=("R.winding=6",)) == 1

@@ -6,9 +6,19 @@ import numpy as np
 import pytest
 from scipy.stats import binom
 
-from app.studies.stress.detection import CHANCE, DETECTION, INVISIBLE, MISNAMED, NAMED, VISIBLE, Foretold, Oracle, make
-from app.studies.stress.matrix import matrix
-from app.studies.stress.scenario import (
+from app.extensions.lab.stress.detection import (
+    CHANCE,
+    DETECTION,
+    INVISIBLE,
+    MISNAMED,
+    NAMED,
+    VISIBLE,
+    Foretold,
+    Oracle,
+    make,
+)
+from app.extensions.lab.stress.matrix import matrix
+from app.extensions.lab.stress.scenario import (
     Bench,
     Mistake,
     accused,
@@ -19,6 +29,7 @@ from app.studies.stress.scenario import (
     said_at,
     without_truth,
 )
+from app.extensions.lab.stress.trials import Trials, all_trials
 from app.twin.twin import load_twin
 from estimators.diagnostics.episodes import Episode
 from estimators.log import INPUT, READING, TICK, TRUTH
@@ -26,6 +37,7 @@ from estimators.models import MODELS
 from estimators.track import ADVISORY, DEGRADED, DIVERGED, SUSPECT, TRACKING, WAITING
 from estimators.tuning import Tuning
 from sources.faults.kinds import problem
+from tests.app.cli.test_main import documented
 from tests.support import SECOND, as_log, log_of
 
 MODEL = MODELS["motor_drive"]
@@ -206,6 +218,7 @@ def test_the_command_prints_a_table_or_json(nisus):
     assert "winding stuck" in out and "2/2" in out and "0 rows wrong and green" in out
     rows = nisus(*given, "--json", "--jobs", 1).json
     assert nisus(*given, "--json", "--jobs", 2).json == rows
+    assert set(rows[0]) <= documented()["stress"]
     made = ["R x100", "winding stuck", "winding stuck from the start"]
     assert [(row["mistake"], row["seed"]) for row in rows] == [(name, seed) for seed in (0, 1) for name in made]
     assert "Wrong, undetected and not listed\n  none" in out
@@ -282,3 +295,13 @@ def test_a_wrong_belief_over_a_recording_is_foretold_by_what_follows(data):
     bench, oracle = Bench(twin, 0, 300.0), Oracle(twin, 300.0)
     told = {name: oracle.foretell(bench, chosen(bench, name), "ekf").verdict for name in ("R /10", "Q /10")}
     assert told == {"R /10": VISIBLE, "Q /10": INVISIBLE}
+
+
+def test_trials_of_a_cluster_are_those_of_this_process():
+    twin = load_twin("motor_winding")
+    chosen = [item for item in enumerate(Trials(twin, 60.0).mistakes) if item[1].name in ("R x10", "winding +5 σ")]
+    given = "motor_winding", {}, (), 60.0, chosen, ("kf", "ukf"), 1
+    here = dict(all_trials(*given, jobs=1))
+    assert len(here) == 4 and {trial.estimator for trial in here.values()} == {"kf", "ukf"}
+    # As text, in which a number that is none is itself.
+    assert repr(sorted(all_trials(*given, cluster="local:2"))) == repr(sorted(here.items()))

@@ -10,6 +10,8 @@ from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 
+from app.twin.sources.asset import make_asset
+from app.twin.twin import Twin
 from config.source_schema import AssetSection, CanSection
 from estimators.diagnostics.episodes import Episode, episodes
 from estimators.diagnostics.sensitivity.responses import SENSOR, SWAP, SWAPPED
@@ -24,9 +26,6 @@ from estimators.tuning import Tuning
 from sources.faults.layer import Faults, FaultySource
 from sources.merged import MemorySource
 from sources.simulator import Simulator
-
-from ...twin.sources.asset import make_asset
-from ...twin.twin import Twin
 
 if TYPE_CHECKING:
     from sources.faults.kinds import Fault

@@ -1,0 +1,1 @@
+"""Regression suite: figures of recordings against those that were accepted."""
