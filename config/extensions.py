@@ -50,6 +50,8 @@ class Extension:
     """Live sources of messages, by `source.type`. `make(opening)` opens one (`app.twin.sources.kind.Opening`)."""
     outputs: Mapping[str, Part] = field(default_factory=dict)
     """By key under `outputs`. `make(section, engine, secrets)` returns an `app.outputs.Output`."""
+    models: Mapping[str, Part] = field(default_factory=dict)
+    """Models in files, by the key of the file in `model`. `make(loaded, section, path)` returns a StateSpaceModel."""
     receivers: Mapping[str, Part] = field(default_factory=dict)
     """Receivers of alerts, by `type`; `make(section, folder, secrets)` returns an `app.outputs.receivers.Receiver`. An
     output of the same name is the receiver itself."""
@@ -60,7 +62,7 @@ class Extension:
     twin between its `start` and `stop`."""
 
 
-Kind = Literal["commands", "sources", "outputs", "receivers"]
+Kind = Literal["commands", "sources", "outputs", "models", "receivers"]
 TAGGED = ("sources", "receivers")
 """Kinds of which a section is recognised by its `type`, a literal that is the name of the part."""
 
@@ -116,6 +118,8 @@ def _usable(reference: str, kind: Kind, key: str) -> Any:
         schema.model_rebuild()
         if kind in TAGGED and get_args(schema.model_fields["type"].annotation) != (key,):
             raise TypeError(f"type of {schema.__name__} is not Literal[{key!r}]")
+        if kind == "models" and key not in schema.model_fields:
+            raise TypeError(f"{schema.__name__} has no field {key}")
     return schema
 
 

@@ -30,12 +30,14 @@ MAX_TIME_S = 9e9
 """Seconds from 1970 until the year 2255: times are int64 nanoseconds, which end soon after."""
 
 
-def refused(kind: Literal["value", "relation", "both", "absent"], text: str, key: str = "") -> PydanticCustomError:
+def refused(
+    kind: Literal["value", "relation", "both", "absent", "no_kind"], text: str, key: str = ""
+) -> PydanticCustomError:
     """Return an error, which `problems.report` completes to a line with place, key and value.
 
     Args:
         kind: value: of a single value. relation: of the section's `key` with others. both: of a section with a key too
-            many, `key`. absent: of a section that lacks a key.
+            many, `key`. absent: of a section that lacks a key. no_kind: of one that lacks the key of its kind.
         text: Rule that a value breaks; for the other kinds the words after the name of the key or section.
         key: The key that is at fault.
     """

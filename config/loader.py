@@ -12,6 +12,7 @@ from pydantic import ValidationError
 
 from estimators.errors import ConfigError, nearest
 
+from .model_schema import kind_of
 from .problems import report, shown
 from .schema import ParameterSection, TwinSection, as_gate
 from .tunings import Version, find_version, keep_options, overlay
@@ -160,8 +161,8 @@ def _paths_of(data: Any, there: Callable[[str], str], folder: Path) -> Iterator[
             yield from of_source(part, (*key, "parts", k))
 
     model = data["model"]
-    if isinstance(model, dict):
-        yield from (((("model", key), there(model[key]))) for key in ("matrices", "fmu") if key in model)
+    if kind := kind_of(model):
+        yield ("model", kind), there(model[kind])
     else:
         yield ("model",), file_of(model)
     if data.get("learned") is not None:

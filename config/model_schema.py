@@ -1,13 +1,13 @@
-"""Schema of models that are not Python: matrices in a file, and FMUs."""
+"""Schema of models that are not Python: matrices in a file, and those of extensions."""
 
 from __future__ import annotations
 
-import re
-from typing import Annotated, Any
+from typing import TYPE_CHECKING, Annotated, Any, Union
 
 from pydantic import BeforeValidator, Discriminator, Field, Tag
 
-from .fields import NotNegative, Seconds, Section, Text, refused
+from .extensions import schemas
+from .fields import NotNegative, Section, Text, refused
 
 
 class MatrixKeysSection(Section):
@@ -42,72 +42,33 @@ class MatricesSection(Section):
     """The sensors in the order of C, with the unit of their row, or the units of several rows by name:
     {gnss: {east: m, north: m}, odometer: m/s}."""
 
-    @property
-    def file(self) -> str:
-        """File of the matrices."""
-        return self.matrices
+
+KINDS: dict[str, type[Section]] = {"matrices": MatricesSection} | schemas("models")
+"""Sections of models by the key of their file."""
 
 
-def variable_name(variable: str) -> str:
-    """Return the name under which a variable of an FMU is known: `car.wheel[1].v` becomes `car_wheel_1_v`."""
-    return re.sub(r"\W+", "_", variable).strip("_")
+def kind_of(model: Any) -> str:
+    """Return the key of the file in a model, as a section or YAML; empty if it is a reference."""
+    keys = model if isinstance(model, dict) else ()
+    return next((key for key, kind in KINDS.items() if key in keys or isinstance(model, kind)), "")
 
 
-def as_variables(value: Any) -> Any:
-    """Return a list of variables as {name: variable}."""
-    if isinstance(value, list) and all(isinstance(item, str) for item in value):
-        return {variable_name(item): item for item in value}
-    return value
-
-
-Variables = Annotated[
-    dict[Text, Text], BeforeValidator(as_variables, json_schema_input_type=dict[Text, Text] | list[Text])
-]
-
-
-class FmuSection(Section):
-    """A model in an FMU for model exchange (FMI 2 or 3). It runs as native code with the rights of the user."""
-
-    fmu: Text
-    """The FMU beside this file."""
-    step: Seconds
-    """Longest step of the integration (Runge-Kutta of fourth order), s. Choose a tenth of the fastest time constant."""
-    states: Variables = {}
-    """Names of continuous states, {speed: der_pos} or a list of variables. Default: the variables' own names, with
-    letters, digits and _ only; all continuous states are states."""
-    inputs: Variables | None = None
-    """Variables that are inputs, {name: variable} or a list. Default: all real inputs of the FMU."""
-    parameters: Variables = {}
-    """Real parameters that may be set or tuned, {name: variable} or a list. Default: none, they keep their start
-    values."""
-    sensors: Annotated[dict[Text, Text | dict[Text, Text]], Field(min_length=1)] | None = None
-    """Measured variables: {sensor: variable}, or {sensor: {row: variable}} for several rows. Default: each real output
-    of the FMU is a sensor."""
-    units: dict[Text, Text] = {}
-    """Units by variable of the FMU where its description has none. Default: those of the description, or 1."""
-
-    @property
-    def file(self) -> str:
-        """File of the FMU."""
-        return self.fmu
-
-
-def _kind(value: Any) -> str:
-    if isinstance(value, (dict, MatricesSection, FmuSection)):
-        return "as_matrices" if isinstance(value, MatricesSection) or "matrices" in value else "as_fmu"
-    return "by_name"
+def model_file(model: Model) -> str:
+    """Return the file of a model, or its reference."""
+    return model if isinstance(model, str) else str(getattr(model, kind_of(model)))
 
 
 def _named(value: Any) -> Any:
-    if isinstance(value, dict) and not {"matrices", "fmu"} & value.keys():
-        raise refused("absent", "names neither matrices nor fmu")
+    if isinstance(value, dict) and not kind_of(value):
+        raise refused("no_kind", f"names {'neither' if len(KINDS) > 1 else 'no'} {' nor '.join(KINDS)}")
     return value
 
 
-Model = Annotated[
-    Annotated[Text, Tag("by_name")]
-    | Annotated[MatricesSection, Tag("as_matrices")]
-    | Annotated[FmuSection, Tag("as_fmu")],
-    Discriminator(_kind),
-    BeforeValidator(_named),
-]
+if TYPE_CHECKING:
+    Model = str | Section
+else:
+    Model = Annotated[
+        Union[Annotated[Text, Tag("as_")], *(Annotated[kind, Tag(f"as_{key}")] for key, kind in KINDS.items())],
+        Discriminator(lambda value: f"as_{kind_of(value)}"),
+        BeforeValidator(_named),
+    ]

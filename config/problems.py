@@ -95,6 +95,8 @@ def _line(problem: ErrorDetails, key: Key, value: Any, places: ValuePlaces) -> s
         return f"{places.at((*key, context['key']))}: {dotted(key)} {problem['msg']}; keep one"
     if kind == "absent":
         return f"{places.at(key)}: {dotted(key)} {problem['msg']}; add it"
+    if kind == "no_kind":
+        return f"{places.at(key)}: {dotted(key)} {problem['msg']}{left_out() or '; add it'}"
     if kind == "union_tag_not_found":
         return f"{places.at(key)}: {dotted((*key, 'type'))} is missing; {_choices(problem)}"
     if kind == "union_tag_invalid":

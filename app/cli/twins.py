@@ -38,11 +38,13 @@ def show_twins(arguments: Arguments) -> int:
 
 
 def _head(loaded: Loaded) -> dict[str, Any]:
+    from config.model_schema import model_file
+
     config = loaded.config
     return {
         "name": loaded.path.stem,
         "title": config.title,
-        "model": config.model if isinstance(config.model, str) else config.model.file,
+        "model": model_file(config.model),
         "estimator": config.estimator.name,
         "source": config.source.type,
         "path": str(loaded.path),

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import hashlib
 import traceback
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
 from math import inf, log, sqrt
 from pathlib import Path
@@ -13,9 +13,10 @@ from typing import Any
 
 import numpy as np
 
+from config.extensions import maker
 from config.fields import bounds
 from config.loader import Loaded, shown_path
-from config.model_schema import FmuSection, MatricesSection, Model
+from config.model_schema import Model, kind_of, model_file
 from config.schema import ParameterSection, PriorSection, SensorSection, TwinSection
 from config.yaml_files import Key, dotted
 from estimators.errors import ConfigError, ModelError, NisusError, nearest, spaced
@@ -31,7 +32,6 @@ from estimators.plausibility import DAY, surprise
 
 from .checks import check_named, check_names, estimated_names, one_each
 from .defaults import instrument_sections, parameter_sections
-from .fmu import fmu_model
 from .landmarks import expanded
 from .learned import load_learned
 from .matrices import matrices_model
@@ -41,16 +41,16 @@ from .sources.kind import signal_ends
 def find_model(loaded: Loaded, key: Key, reference: Model) -> StateSpaceModel:
     """Return the model that `reference`, the value at `key`, means.
 
-    It is a name, ./file.py:Name beside the YAML, or the section of a file of matrices or of an FMU.
+    It is a name, ./file.py:Name beside the YAML, or the section of a file of matrices or of an extension.
 
     Raises:
         ConfigError: If there is no such model or file.
         ModelError: If the user's file fails, with its file and line.
     """
-    if isinstance(reference, MatricesSection):
-        return matrices_model(loaded, reference, _existing(loaded, (*key, "matrices"), reference.matrices))
-    if isinstance(reference, FmuSection):
-        return fmu_model(loaded, reference, _existing(loaded, (*key, "fmu"), reference.fmu))
+    if not isinstance(reference, str):
+        kind = kind_of(reference)
+        make: Callable[..., StateSpaceModel] = matrices_model if kind == "matrices" else maker("models", kind)
+        return make(loaded, reference, _existing(loaded, (*key, kind), model_file(reference)))
     file, _, name = reference.rpartition(":")
     if not file and not reference.endswith(".py"):
         if reference in MODELS:
@@ -71,7 +71,7 @@ def model_files(loaded: Loaded) -> tuple[Path, ...]:
     """Return the user's file of the model and those beside it that it imports; none for a bundled model."""
     model = loaded.config.model
     if not isinstance(model, str):
-        return (_beside(loaded, model.file),)
+        return (_beside(loaded, model_file(model)),)
     file = model.rpartition(":")[0]
     if not file:
         return ()

@@ -12,15 +12,15 @@ from weakref import WeakValueDictionary
 
 import numpy as np
 
+from app.twin.checks import check_stated
 from config.loader import Loaded
-from config.model_schema import FmuSection, variable_name
 from config.yaml_files import Key, shown_path
 from estimators.errors import ModelError, nearest
 from estimators.model.state_space import Input, Noise, Parameter, Row, Sensor, State, StateSpaceModel, squared
 from sources.worker_process import gist
 
-from .checks import check_stated
-from .fmu_instance import Fmu
+from .instance import Fmu
+from .schema import FmuSection, variable_name
 
 EXCHANGE = "export it for model exchange"
 

@@ -170,13 +170,13 @@ def test_events_act_at_the_ends_of_steps(tmp_path, version):
     )
 
 
-@cases(__file__, "fmu_needs.csv")
+@cases(__file__, "needs.csv")
 def test_what_a_filter_needs_is_checked_on_load(tmp_path, given, says):
     said = refused(tmp_path, build(tmp_path, **json.loads(given)))
     assert says in said and ".fmu: " in said
 
 
-@cases(__file__, "fmu_names.csv")
+@cases(__file__, "names.csv")
 def test_what_the_yaml_may_not_name(tmp_path, old, new, says):
     assert says in refused(tmp_path, build(tmp_path), FMU.replace(old, new))
 
