@@ -52,6 +52,9 @@ class Extension:
     """By key under `outputs`. `make(section, engine, secrets)` returns an `app.outputs.Output`."""
     models: Mapping[str, Part] = field(default_factory=dict)
     """Models in files, by the key of the file in `model`. `make(loaded, section, path)` returns a StateSpaceModel."""
+    executors: Mapping[str, Part] = field(default_factory=dict)
+    """Work on other machines, at the address that `--cluster` gives. `calls`: `make(address, begin, given)`; `folds`:
+    `make(address, twin, held, name, overrides)`. Each is a context manager; see `app.studies.processes`."""
     receivers: Mapping[str, Part] = field(default_factory=dict)
     """Receivers of alerts, by `type`; `make(section, folder, secrets)` returns an `app.outputs.receivers.Receiver`. An
     output of the same name is the receiver itself."""
@@ -62,7 +65,7 @@ class Extension:
     twin between its `start` and `stop`."""
 
 
-Kind = Literal["commands", "sources", "outputs", "models", "receivers"]
+Kind = Literal["commands", "sources", "outputs", "models", "executors", "receivers"]
 TAGGED = ("sources", "receivers")
 """Kinds of which a section is recognised by its `type`, a literal that is the name of the part."""
 

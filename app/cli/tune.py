@@ -25,8 +25,8 @@ from ..live.tunings.tuning_yaml import tuning_yaml
 from ..live.tunings.versions import apply_tuning, check_free, keep, settings_of, version_text, widths_of
 from ..present.result import to_text
 from ..present.runs_json import fit_json
-from ..studies.cluster_executor import executor_of
 from ..studies.fold_result import rows_of
+from ..studies.processes import executor_of
 from ..studies.tune import fit_text, heading, sections, window_json, window_topics, windows_verdict
 from ..terminal import complain
 from ..twin.defaults import bounds_of, natural_aim, width_priors

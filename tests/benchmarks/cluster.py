@@ -12,8 +12,7 @@ from typing import Any
 import numpy as np
 
 from app.studies.check import check
-from app.studies.cluster_executor import executor_of
-from app.studies.processes import results
+from app.studies.processes import executor_of, results
 from app.twin.twin import load_twin, with_held
 from estimators.errors import NisusError
 from estimators.fit.fit import fit

@@ -6,27 +6,25 @@ import socket
 import subprocess
 import sys
 from collections import Counter
-from concurrent.futures import Executor, Future, ProcessPoolExecutor
-from multiprocessing import get_context
+from concurrent.futures import Future
 
 import numpy as np
 import pytest
 
+from app.extensions.cluster import executor as module
+from app.extensions.cluster.executor import ClusterExecutor, functions_of, packed, unpacked
 from app.present.result import to_json
-from app.present.runs_json import fit_json
-from app.studies import cluster_executor
 from app.studies.check import check, figures
 from app.studies.checklist import checklist
-from app.studies.cluster_executor import ClusterExecutor, executor_of, functions_of, packed, unpacked
+from app.studies.processes import executor_of
 from app.twin.log_reader import read_log
 from app.twin.twin import load_twin, with_held
 from estimators.errors import ConfigError
 from estimators.fit.fit import fit
 from estimators.fit.objective import Cancelled
 from estimators.fit.recording import Recording
-from estimators.tuning import Tuning
 from tests import ROOT
-from tests.estimators.fit.test_fit import MODEL, log_of, simulated
+from tests.app.studies.test_fit_executor import bits
 from tests.waiting import LIMIT_S
 
 NAME, OVERRIDES = "motor_winding", {"R.winding": "0.2"}
@@ -46,10 +44,6 @@ def fitted(twin, log, **options):
     return fit(twin.estimator, with_held(twin).tuning, [Recording(log.copy())], **options)
 
 
-def bits(found):
-    return repr(fit_json(found)), found.correlation.tobytes(), found.after.held_out.terms.tobytes()
-
-
 def checked(twin, log, **options):
     found = check(twin, log.copy(), Counter(), **options)
     told = figures(found, checklist(found))
@@ -59,7 +53,7 @@ def checked(twin, log, **options):
 
 @pytest.mark.parametrize("task", [1e-9, 1e9], ids=["one call a task", "one task a worker"])
 def test_a_fit_on_a_cluster_is_the_same_bits(scheduler, twin, log, task, monkeypatch):
-    monkeypatch.setattr(cluster_executor, "TASK_S", task)
+    monkeypatch.setattr(module, "TASK_S", task)
     with executor_of(scheduler, twin, with_held(twin), NAME, OVERRIDES) as executor:
         found = fitted(twin, log, executor=executor)
     assert bits(found) == bits(fitted(twin, log)) == bits(fitted(twin, log, executor=None))
@@ -69,41 +63,6 @@ def test_a_check_on_a_cluster_is_the_same_bits(scheduler, twin, log):
     with executor_of(scheduler, twin, with_held(twin), NAME, OVERRIDES) as executor:
         found = checked(twin, log, executor=executor)
     assert len(found) > 8 and to_json(found) == to_json(checked(twin, log))
-
-
-def both_report():
-    log = log_of(simulated(3, 300))
-    log.add("silent", np.arange(300) + 0.5, simulated(4, 300))
-    return log
-
-
-class Counting(Executor):
-    """Makes calls here, and counts them."""
-
-    def __init__(self):
-        self.calls = 0
-
-    def map(self, fn, *iterables, timeout=None, chunksize=1):
-        for items in zip(*iterables, strict=True):
-            self.calls += 1
-            yield fn(*items)
-
-
-def test_every_fold_of_a_fit_is_made_in_its_executor():
-    executor = Counting()
-    options = {"wanted": ("Q", "R"), "considered": {"rate": 0.05, "offset": 1.0}}
-    found = fit("kf", Tuning.of(MODEL), [Recording(both_report())], executor=executor, **options)
-    assert found.widths is not None and len(found.after.held_out.sensors) == 2
-    assert executor.calls == found.folds  # of one recording
-
-
-def test_judgement_and_widths_in_processes_are_the_same_bits():
-    options = {"considered": {"rate": 0.05, "offset": 1.0}}
-    with ProcessPoolExecutor(2, get_context("spawn")) as executor:
-        found = fit("kf", Tuning.of(MODEL), [Recording(both_report())], executor=executor, **options)
-    here = fit("kf", Tuning.of(MODEL), [Recording(both_report())], executor=None, **options)
-    assert bits(found) == bits(here) and found.widths.envelope == here.widths.envelope
-    assert found.widths.std.tobytes() == here.widths.std.tobytes()
 
 
 class Here:
@@ -195,11 +154,6 @@ def test_functions_are_sent_as_their_places_and_arrays_are_aligned():
     assert unpacked(data, list(reversed(functions)))[1].f is not other.model.f
 
 
-def test_without_a_cluster_the_folds_run_in_threads(twin):
-    with executor_of(None, twin, twin, NAME, OVERRIDES) as executor:
-        assert executor == "threads"
-
-
 @pytest.mark.parametrize("command", ["check", "tune"])
 def test_the_commands_take_a_cluster(nisus, command):
     assert "--cluster nowhere: " in nisus.refuses(command, NAME, "--duration", 60, "--cluster", "nowhere")
@@ -216,7 +170,7 @@ def test_a_wrong_address_ends_the_command():
 
 
 def test_a_server_of_another_kind_is_told(twin, monkeypatch):
-    monkeypatch.setattr("app.studies.processes.CONNECT_S", 0.5)
+    monkeypatch.setattr("app.extensions.cluster.workers.CONNECT_S", 0.5)
     with socket.socket() as silent:
         silent.bind(("127.0.0.1", 0))
         silent.listen()

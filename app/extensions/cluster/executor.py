@@ -13,8 +13,9 @@ from functools import partial
 from time import perf_counter
 from typing import Any
 
-from ..twin.twin import Twin, load_twin, with_held
-from .processes import Cluster, dask
+from app.twin.twin import Twin, load_twin, with_held
+
+from .workers import Cluster, dask
 
 TASK_S = 0.1  # seconds of a task at least: a cluster takes a few milliseconds for one
 
@@ -32,24 +33,8 @@ _kept: dict[str, Callable[..., Any]] = {}
 
 
 @contextmanager
-def executor_of(
-    cluster: str | None, twin: Twin, held: Twin, name: str, overrides: Mapping[str, str]
-) -> Iterator[Executor | str]:
-    """Context manager: an Executor on a cluster whose workers load a twin, or "threads" without a cluster.
-
-    Args:
-        cluster: See `results`; None for none.
-        twin: The twin whose folds are called.
-        held: The same with its considered parameters held, see `with_held`.
-        name: Its name or path, as the workers load it.
-        overrides: As of `load_twin`.
-
-    Raises:
-        ConfigError: As `results`.
-    """
-    if cluster is None:
-        yield "threads"
-        return
+def folds_of(cluster: str, twin: Twin, held: Twin, name: str, overrides: Mapping[str, str]) -> Iterator[Executor]:
+    """Context manager: an Executor for the folds of a twin; see `app.studies.processes.executor_of`."""
     with dask(cluster, _load, (name, dict(overrides))) as workers:
         yield ClusterExecutor(workers, [*functions_of(twin.model), *functions_of(held.model)])
 

@@ -10,7 +10,7 @@ from pathlib import Path
 
 import pytest
 
-from app.studies import processes
+from app.extensions.cluster import workers as module
 from tests import ROOT
 from tests.waiting import LIMIT_S, wait_for
 
@@ -18,8 +18,8 @@ from tests.waiting import LIMIT_S, wait_for
 @pytest.fixture(autouse=True)
 def patience(monkeypatch):
     """A busy machine may take minutes to start a worker."""
-    monkeypatch.setattr(processes, "WAIT_S", LIMIT_S)
-    monkeypatch.setattr(processes, "CONNECT_S", LIMIT_S)
+    monkeypatch.setattr(module, "WAIT_S", LIMIT_S)
+    monkeypatch.setattr(module, "CONNECT_S", LIMIT_S)
 
 
 @contextmanager

@@ -1,0 +1,10 @@
+"""Work on a Dask cluster: `--cluster ADDRESS`."""
+
+from config.extensions import Extension, Part
+
+EXTENSION = Extension(
+    executors={
+        "calls": Part("builtins:str", f"{__name__}.workers:dask"),
+        "folds": Part("builtins:str", f"{__name__}.executor:folds_of"),
+    }
+)
