@@ -93,7 +93,8 @@ def executor_of(
 
 def _elsewhere(kind: str, cluster: str, *given: Any) -> AbstractContextManager[Any]:
     if kind not in registered("executors"):
-        raise ConfigError(f"--cluster {cluster}: needs an extension that is not installed{left_out()}")
+        text = "needs an extension; install it with `pip install 'nisus[cluster]'`"
+        raise ConfigError(f"--cluster {cluster}: {text}{left_out()}")
     found: AbstractContextManager[Any] = maker("executors", kind)(cluster, *given)
     return found
 

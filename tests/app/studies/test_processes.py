@@ -92,8 +92,8 @@ def test_a_cluster_has_processes_of_its_own():
 )
 def test_a_cluster_without_its_extension_is_one_line(work, monkeypatch):
     monkeypatch.setattr(processes, "registered", lambda kind: {})
-    monkeypatch.setitem(extensions._left_out, "cluster", "no module")
-    text = r"^--cluster local:2: needs an extension .* installed; extensions .* loaded: cluster \(no module\)$"
+    monkeypatch.setitem(extensions._left_out, "dask", "no module")
+    text = r"^--cluster local:2: needs an extension; .*'nisus\[cluster\]'`; ext.* loaded: .*\bdask \(no module\)$"
     with pytest.raises(ConfigError, match=text):
         work()
 

@@ -1,4 +1,4 @@
-"""Calls on a Dask cluster: what it does, and one line for what goes wrong."""
+"""Calls on a Dask cluster: their results, and one line for each fault."""
 
 import multiprocessing
 import os
