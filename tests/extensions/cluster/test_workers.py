@@ -12,8 +12,6 @@ import pytest
 
 from app.extensions.cluster import workers
 from app.studies.processes import results
-from app.studies.stress.trials import Trials, all_trials
-from app.twin.twin import load_twin
 from estimators.errors import ConfigError
 from tests.extensions.cluster.conftest import started
 from tests.waiting import wait_for
@@ -119,16 +117,6 @@ def test_a_call_that_kills_workers_is_one_line(tmp_path):
     with started(tmp_path, 1, DASK_DISTRIBUTED__SCHEDULER__ALLOWED_FAILURES="0") as (address, _):
         with pytest.raises(ConfigError, match="1 workers died in one call; is their memory enough"):
             list(results(die, [()], cluster=address))
-
-
-def test_trials_of_a_cluster_are_those_of_this_process(scheduler):
-    twin = load_twin("motor_winding")
-    chosen = [item for item in enumerate(Trials(twin, 60.0).mistakes) if item[1].name in ("R x10", "winding +5 σ")]
-    given = "motor_winding", {}, (), 60.0, chosen, ("kf", "ukf"), 1
-    here = dict(all_trials(*given, jobs=1))
-    assert len(here) == 4 and {trial.estimator for trial in here.values()} == {"kf", "ukf"}
-    # As text, in which a number that is none is itself.
-    assert repr(sorted(all_trials(*given, cluster=scheduler))) == repr(sorted(here.items()))
 
 
 def test_a_cluster_of_ones_own_ends_with_the_command():
