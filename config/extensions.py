@@ -29,13 +29,16 @@ T = TypeVar("T")
 class Part(NamedTuple):
     """One thing that an extension adds. Both are references, `module:name`, which are imported when they are needed.
 
-    `schema` is the class of what a user gives: a dataclass of options, or a `Section` of the YAML. `make` is called
-    with it, and with what `Extension` says. `text` describes a key in the schema of the YAML.
+    `schema` is the class of what a user gives, if anything: a dataclass of options, or a `Section` of the YAML. `make`
+    is called with it, and with what `Extension` says. `text` describes a key in the schema of the YAML.
     """
 
     schema: str
     make: str
     text: str = ""
+
+
+Parts = Mapping[str, Part]
 
 
 @dataclass(frozen=True)
@@ -44,28 +47,37 @@ class Extension:
 
     needs: tuple[str, ...] = ()
     """Names of the extensions whose modules it imports."""
-    commands: Mapping[str, Part] = field(default_factory=dict)
+    commands: Parts = field(default_factory=dict)
     """By the word after `nisus`. `make(options)` runs the command and returns the exit status."""
-    sources: Mapping[str, Part] = field(default_factory=dict)
+    sources: Parts = field(default_factory=dict)
     """Live sources of messages, by `source.type`. `make(opening)` opens one (`app.twin.sources.kind.Opening`)."""
-    outputs: Mapping[str, Part] = field(default_factory=dict)
+    outputs: Parts = field(default_factory=dict)
     """By key under `outputs`. `make(section, engine, secrets)` returns an `app.outputs.Output`."""
-    models: Mapping[str, Part] = field(default_factory=dict)
-    """Models in files, by the key of the file in `model`. `make(loaded, section, path)` returns a StateSpaceModel."""
-    executors: Mapping[str, Part] = field(default_factory=dict)
-    """Work on other machines, at the address that `--cluster` gives. `calls`: `make(address, begin, given)`; `folds`:
-    `make(address, twin, held, name, overrides)`. Each is a context manager; see `app.studies.processes`."""
-    receivers: Mapping[str, Part] = field(default_factory=dict)
+    receivers: Parts = field(default_factory=dict)
     """Receivers of alerts, by `type`; `make(section, folder, secrets)` returns an `app.outputs.receivers.Receiver`. An
     output of the same name is the receiver itself."""
+    models: Parts = field(default_factory=dict)
+    """Models in files, by the key of the file in `model`. `make(loaded, section, path)` returns a StateSpaceModel."""
+    executors: Parts = field(default_factory=dict)
+    """Work on other machines, at the address that `--cluster` gives. `calls`: `make(address, begin, given)`; `folds`:
+    `make(address, twin, held, name, overrides)`. Each is a context manager; see `app.studies.processes`."""
+    tables: Parts = field(default_factory=dict)
+    """Files of tables, by the ending of the name. `make` is a `sources.tables.rows.TableFormat`."""
+    folders: Parts = field(default_factory=dict)
+    """Folders that are one recording, by a file in them. `make(folder)` returns their files in order."""
+    tracks: Parts = field(default_factory=dict)
+    """Files of `nisus fold --out`, by ending. `make(path)` returns `write(file, twin, fold, smoothed)`, or refuses."""
+    archives: Parts = field(default_factory=dict)
+    """Of `--archive`: `rows`. `make(folder, split, engine, stored)` returns what archives the rows of a running twin
+    between its `start` and `stop`."""
+    routes: Parts = field(default_factory=dict)
+    """Routes beside those of the page, by path. `make(engine)` returns one, as `app.web.http.get` does."""
 
-    hooks: Mapping[str, str] = field(default_factory=dict)
-    """References to functions that the core calls. `routes(engine)` returns routes beside those of the page, as
-    `app.web.http.get` makes them. `archive(folder, split, engine, stored)` returns what archives the rows of a running
-    twin between its `start` and `stop`."""
 
-
-Kind = Literal["commands", "sources", "outputs", "models", "executors", "receivers"]
+Kind = Literal[
+    "commands", "sources", "outputs", "receivers", "models", "executors", "tables", "folders", "tracks", "archives",
+    "routes",
+]  # fmt: skip
 TAGGED = ("sources", "receivers")
 """Kinds of which a section is recognised by its `type`, a literal that is the name of the part."""
 
@@ -126,38 +138,25 @@ def _usable(reference: str, kind: Kind, key: str) -> Any:
     return schema
 
 
-def maker(kind: Kind, key: str) -> Callable[..., Any]:
-    """Return the function of a part.
+def maker(kind: Kind, key: str, asked: str = "") -> Callable[..., Any]:
+    """Return the function of a part; `asked` is what needs it.
 
     Raises:
-        ConfigError: If it cannot be imported.
+        ConfigError: If no extension has it, or it cannot be imported.
     """
-    name, part = registered(kind)[key]
-    return _imported(name, part.make)
-
-
-def hooks(key: str) -> list[Callable[..., Any]]:
-    """Return the functions of all extensions that have this hook, without those that cannot be imported."""
-    named = ((name, item.hooks[key]) for name, item in extensions().items() if key in item.hooks)
-    return [found for name, reference in named if (found := _tried(name, partial(_imported, name, reference)))]
-
-
-def hook(key: str, asked: str) -> Callable[..., Any]:
-    """Return the function of the first extension that has a hook.
-
-    Raises:
-        ConfigError: If none has it; `asked` is what needs it.
-    """
-    if not (found := hooks(key)):
+    if key not in registered(kind):
         raise ConfigError(f"{asked}: needs an extension that is not installed{left_out()}")
-    return found[0]
-
-
-def _imported(name: str, reference: str) -> Any:
+    name, part = registered(kind)[key]
     try:
-        return pkgutil.resolve_name(reference)
+        return pkgutil.resolve_name(part.make)
     except Exception as error:  # noqa: BLE001  the module may be of a third party
         raise ConfigError(f"extension {name}: {_gist(error)}; install its package again") from None
+
+
+def makers(kind: Kind) -> list[Callable[..., Any]]:
+    """Return the functions of all parts of a kind, without those that cannot be imported."""
+    named = ((name, partial(maker, kind, key)) for key, (name, _) in registered(kind).items())
+    return [found for name, work in named if (found := _tried(name, work)) is not None]
 
 
 def _tried(name: str, work: Callable[[], T]) -> T | None:

@@ -3,21 +3,38 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Sequence
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
-from typing import BinaryIO
+from typing import Any, BinaryIO, Literal
 
 from estimators.errors import SourceError
 
 CAN_LOGS = (".asc", ".blf", ".csv", ".db", ".log", ".mf4", ".trc")  # Endings of CAN logs
 
-BAGS = (".mcap", ".db3")  # Endings of the files of bags of ROS 2
+TABLES = (".csv", ".parquet", ".pq", ".mat", ".npz")
 
-TABLES = (".csv", ".parquet", ".pq", ".mat", ".npz", *BAGS)
-"""Endings of tables. A table of any other ending is read as CSV."""
+EXTRAS = {".mcap": "robotics", ".db3": "robotics"}
+"""Endings of tables that a bundled extension reads, which is named where it is missing."""
 
 COMPRESSIONS = (".gz", ".bz2", ".lz4", ".zst")
 """Endings of compressed files, after that of the format. Of CAN logs, python-can reads `.gz` only."""
+
+
+def _nothing(kind: Literal["tables", "folders"]) -> Mapping[str, Callable[[], Any]]:
+    return {}
+
+
+added = _nothing
+"""What extensions add, each as a function that loads it; the application sets it, a reader process has none.
+
+added("tables"): a `tables.rows.TableFormat`, by the ending of the name. added("folders"): for folders that are one
+recording, by a file in them, a function that returns the recordings in a folder.
+"""
+
+
+def tables() -> tuple[str, ...]:
+    """Return the endings of tables. A table of any other ending is read as CSV."""
+    return *TABLES, *dict.fromkeys((*EXTRAS, *added("tables")))
 
 
 def suffix_of(path: Path) -> str:
@@ -33,32 +50,24 @@ def is_compressed(path: Path) -> bool:
 
 def is_recording(name: str) -> bool:
     """Return whether a file of this name can replace a twin's own recording."""
-    return suffix_of(Path(name)) in {*CAN_LOGS, *TABLES}
-
-
-BAG_FILE = "metadata.yaml"  # File of a folder that is a bag of ROS 2, with the names of its recordings
+    return suffix_of(Path(name)) in {*CAN_LOGS, *tables()}
 
 
 def files_of(path: Path) -> list[Path]:
-    """Return the recordings of a folder that is a bag, in their order; any other path as it is.
+    """Return the recordings of a folder that is one recording, in their order; any other path as it is.
 
     Raises:
-        SourceError: If the bag does not name its recordings, or they are compressed as files.
+        SourceError: If the folder does not name its recordings, or they cannot be read.
     """
-    content = path / BAG_FILE
-    if not content.is_file():
-        return [path]
-    import yaml
+    for name, files in added("folders").items() if path.is_dir() else ():
+        if (path / name).is_file():
+            return list(files()(path))
+    return [path]
 
-    try:
-        info = yaml.safe_load(content.read_text(encoding="utf-8"))["rosbag2_bagfile_information"]
-        files = [path / Path(name).name for name in info["relative_file_paths"]]
-    except (OSError, ValueError, KeyError, TypeError, yaml.YAMLError):
-        raise SourceError(f"{content}: does not list the files of the bag; name its .mcap or .db3 files") from None
-    for file in files:
-        if file.suffix not in BAGS:
-            raise SourceError(f"{file}: is no {' or '.join(BAGS)}; if it is compressed, unpack it and name the file")
-    return files
+
+def is_whole(folder: Path) -> bool:
+    """Return whether a folder is one recording, whose files `files_of` returns."""
+    return folder.is_dir() and any((folder / name).is_file() for name in added("folders"))
 
 
 def check_once(files: Sequence[Path], where: str = "") -> None:

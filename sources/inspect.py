@@ -22,7 +22,7 @@ from .can.readers import EXTENDED, BusName, LogSummary, Raw
 from .formats import CAN_LOGS, check_once, check_present, suffix_of
 from .source import UNDATED, Channel
 from .tables.order import Order, time_order
-from .tables.rows import TableRows, is_bag, is_text, names_of, rows_of
+from .tables.rows import TableRows, format_of, is_text, names_of, rows_of
 from .tables.text import NO_VALUE, QUALITY_WORD, UNREADABLE, TextMatch, csv_format, open_text
 from .tables.times import CLOCK, DAY, SKIPPED, TWICE, TimeColumn, TimeReader
 from .units import heading_unit, suffix_unit
@@ -318,8 +318,9 @@ def _tables(files: list[Path], time: TimeColumn) -> RecordingContents:
     times, values = [], []
     counted: dict[str, list[str]] = {UNDATED: [], TWICE: [], SKIPPED: []}
     order = Order(time.label, time.unit, HORIZON_NS, lambda key, text: None if text in faults else faults.append(text))
-    if is_bag(files[0]):
-        return _bags(files, time, columns, order, faults)
+    form = format_of(files[0])
+    if form is not None and form.sparse:
+        return _sparse(files, time, columns, order, faults)
     for path in files:
         for rows in _rows(path, time, columns, faults, counted):
             times.append(rows.t[rows.known])
@@ -359,10 +360,10 @@ def _tables(files: list[Path], time: TimeColumn) -> RecordingContents:
     return RecordingContents(files, "table", t, columns=found, time=time, faults=faults, texts=texts, by=by)
 
 
-def _bags(
+def _sparse(
     files: list[Path], time: TimeColumn, columns: list[str], order: Order, faults: list[str]
 ) -> RecordingContents:
-    """Return the contents of bags, whose rows each have the columns of one topic."""
+    """Return the contents of tables whose rows each have only some of the columns."""
     times = []
     cells: dict[str, list[tuple[np.ndarray, np.ndarray]]] = {name: [] for name in columns}
     for path in files:

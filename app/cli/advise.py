@@ -11,7 +11,7 @@ from config.loader import moved, shipped
 from config.yaml_files import rewrite
 from estimators.errors import ConfigError
 from estimators.log import READING, Log
-from sources.formats import BAG_FILE
+from sources.formats import is_whole
 
 from ..format_time import counted
 from ..present.result import TableColumn, Topic, to_json, to_text
@@ -52,12 +52,12 @@ def advise(arguments: Arguments) -> int:
     Raises:
         ConfigError: If twins and recordings are mixed, or an option does not apply.
     """
-    bags = [what for what in arguments.what if what not in shipped() and (Path(what) / BAG_FILE).is_file()]
+    whole = [what for what in arguments.what if what not in shipped() and is_whole(Path(what))]
     for what in arguments.what:
-        if what not in (*shipped(), *bags) and Path(what).is_dir():
+        if what not in (*shipped(), *whole) and Path(what).is_dir():
             raise ConfigError(f"{what}: it is a folder; name a twin's YAML or recordings in it")
     twins = [what for what in arguments.what if what in shipped() or Path(what).suffix in (".yaml", ".yml")]
-    if not twins and all(Path(what).suffix or what in bags for what in arguments.what):
+    if not twins and all(Path(what).suffix or what in whole for what in arguments.what):
         if arguments.apply or arguments.log or arguments.set or arguments.estimator:
             raise ConfigError("--apply, --log, --set and --estimator are for a twin; a recording is drafted with --out")
         return _draft(arguments, tuple(Path(what) for what in arguments.what))

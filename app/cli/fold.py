@@ -4,9 +4,11 @@ from __future__ import annotations
 
 import os
 import time
+from collections.abc import Callable
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+from config.extensions import left_out, maker, registered
 from config.yaml_files import writing
 from estimators.diagnostics.episodes import episodes
 from estimators.diagnostics.score import score
@@ -46,13 +48,14 @@ def fold_twin(arguments: Arguments) -> int:
     """Run the command."""
     twin = opened(arguments)
     out = arguments.out
-    if out is not None and out.suffix not in (".csv", ".parquet", ".mcap", ".rrd"):
-        raise ConfigError(f"--out {out}: must end in .csv, .parquet, .mcap or .rrd")
-    bag = out is not None and out.suffix == ".mcap"
-    if out is not None and bag:
-        from ..present.export.bag_file import check_bag
-
-        check_bag(out)
+    write: Callable[..., None] | None = None
+    if out is not None:
+        others = registered("tracks")
+        if out.suffix in others:
+            write = maker("tracks", out.suffix)(out)
+        elif out.suffix not in (".csv", ".parquet", ".rrd"):
+            endings = ", ".join((".csv", ".parquet", *others))
+            raise ConfigError(f"--out {out}: must end in {endings} or .rrd{left_out()}")
     recorded = out is not None and out.suffix == ".rrd"
     if out is not None and recorded and os.path.lexists(out):
         raise ConfigError(f"--out {out}: {TAKEN}")
@@ -67,7 +70,7 @@ def fold_twin(arguments: Arguments) -> int:
     prepare(twin)
     log, counts = read_log(twin, arguments.duration, blind=arguments.blind)
     known = known_states(twin, log.events)
-    kept = with_covariance(twin, log.events, twin.model.shown) if bag else []
+    kept = with_covariance(twin, log.events, twin.model.shown) if write else []
     begun = time.perf_counter()
     fold = fold_log(twin, log, picture=twin.picture if recorded else None, pairs=pairs_with(twin, kept or known))
     seconds = (time.perf_counter() - begun) / log.n
@@ -89,7 +92,7 @@ def fold_twin(arguments: Arguments) -> int:
         coverage_of(fold, part),
     )
     if out is not None:
-        _write(out, result, smoothed)
+        _write(out, result, smoothed, write)
     if arguments.html is not None:
         from ..present.export.report import Reported, report
         from ..present.result import to_html
@@ -110,8 +113,8 @@ def fold_twin(arguments: Arguments) -> int:
     return 0
 
 
-def _write(path: Path, result: FoldResult, smoothed: Smoothed | None) -> None:
-    """Write the track as a recording, a bag or a table."""
+def _write(path: Path, result: FoldResult, smoothed: Smoothed | None, write: Callable[..., None] | None) -> None:
+    """Write the track as a recording, a table, or as an extension does."""
     twin, fold = result.twin, result.fold
     found = [item.episode for item in result.episodes]
     if path.suffix == ".rrd":
@@ -119,12 +122,9 @@ def _write(path: Path, result: FoldResult, smoothed: Smoothed | None) -> None:
 
         write_recording(path, twin, fold.log, fold.track, pictures_of(fold), found, smoothed)
         return
-    if path.suffix == ".mcap":
-        from ..present.export.bag_file import covariances, write_bag
-
-        cov = covariances(twin.model, fold.track, fold.pairs)
+    if write is not None:
         with writing(path, "--out"), path.open("wb") as file:
-            write_bag(file, twin.name, twin.model, fold.log.events, fold.track, cov, smoothed)
+            write(file, twin, fold, smoothed)
         return
     from estimators.interface.table import table_of
 

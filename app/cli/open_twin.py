@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from config.extensions import hook
+from config.extensions import maker
 from config.loader import shipped
 
 from ..twin.log_reader import remarking
@@ -67,7 +67,7 @@ def opened_twin(
     if store is not None and store.is_dir():
         store = store / f"{twin.name}.store"
     source = live_source(twin, speed)
-    made = None if archive is None else partial(hook("archive", f"--archive {archive}"), archive / twin.name, split)
+    made = None if archive is None else partial(maker("archives", "rows", "--archive"), archive / twin.name, split)
     stamp = stamp_of(twin.files)
     return OpenedTwin(twin, source, files=twin.files, stamp=stamp, again=read, store=store, archive=made)
 

@@ -20,7 +20,7 @@ from starlette.routing import BaseRoute, Mount, Route, WebSocketRoute
 from starlette.staticfiles import StaticFiles
 from starlette.websockets import WebSocket
 
-from config.extensions import hooks
+from config.extensions import makers
 from estimators.errors import ConfigError, NisusError
 
 from ..live.engine import STATUS_PERIOD_S
@@ -172,7 +172,7 @@ class PageServer:
             *readings.routes(self._engine),
             *self._runs.routes(),
             *self._fit.routes(),
-            *(route for routes in hooks("routes") for route in routes(self._engine)),
+            *(make(self._engine) for make in makers("routes")),
             post("/api/command", self._command, status=202, body_schema=commands_schema),
             get("/api/forecast", self._forecasts.may, refused=409),
             post("/api/forecast", self._forecast, run=OneAtATime("forecast")),

@@ -13,10 +13,9 @@ import numpy as np
 
 from estimators.errors import SourceError, quoted
 
-from ..formats import BAGS, suffix_of
+from .. import formats
 from ..source import UNDATED
 from ..worker_process import IsolatedReader, read_isolated
-from .bag import bag_names, read_bag
 from .binary import mat_names, npz_names, parquet_names, read_mat, read_npz, read_parquet
 from .text import Chunk, Column, Problem, csv_format, read_csv
 from .times import TimeColumn, TimeReader
@@ -24,15 +23,26 @@ from .times import TimeColumn, TimeReader
 _Names = Callable[[Path, str], list[str]]
 _Read = Callable[[Path, Any, Sequence[Column], Problem], Iterator[Chunk]]
 
-_BINARY: dict[str, tuple[_Names, _Read]] = {
-    ".db3": (bag_names, read_bag),
-    ".mat": (mat_names, read_mat),
-    ".mcap": (bag_names, read_bag),
-    ".npz": (npz_names, read_npz),
-    ".parquet": (parquet_names, read_parquet),
-    ".pq": (parquet_names, read_parquet),
+
+class TableFormat(NamedTuple):
+    """How a table that is no CSV is read, in a process of its own; its functions are importable by name.
+
+    `names(path, time)`, `read(path, time, columns, problem)`. Rows of a `sparse` one have only some of the columns.
+    """
+
+    names: _Names
+    read: _Read
+    sparse: bool = False
+
+
+_FORMATS = {
+    ".csv": None,
+    ".mat": TableFormat(mat_names, read_mat),
+    ".npz": TableFormat(npz_names, read_npz),
+    ".parquet": TableFormat(parquet_names, read_parquet),
+    ".pq": TableFormat(parquet_names, read_parquet),
 }
-"""By the ending of the name. All others are CSV."""
+"""By the ending of the name; None for a CSV."""
 
 
 class TableRows(NamedTuple):
@@ -50,14 +60,26 @@ class TableRows(NamedTuple):
     words: tuple[str, ...] = ()
 
 
+def format_of(path: Path) -> TableFormat | None:
+    """Return how a table is read, by the ending of its name; None of a CSV, as all others are.
+
+    Raises:
+        SourceError: If its extension is missing.
+    """
+    suffix = formats.suffix_of(path)
+    if suffix in _FORMATS:
+        return _FORMATS[suffix]
+    if suffix in (found := formats.added("tables")):
+        form: TableFormat = found[suffix]()
+        return form
+    if extra := formats.EXTRAS.get(suffix):
+        raise SourceError(f"{path}: needs the extension {extra}, which is not there: pip install 'nisus[{extra}]'")
+    return None
+
+
 def is_text(path: Path) -> bool:
     """Return whether a table is read as a CSV, whose reader cannot crash."""
-    return suffix_of(path) not in _BINARY
-
-
-def is_bag(path: Path) -> bool:
-    """Return whether a table is a bag of ROS 2, each of whose rows has the columns of one topic."""
-    return suffix_of(path) in BAGS
+    return format_of(path) is None
 
 
 def names_of(path: Path, time: str = "") -> list[str]:
@@ -66,10 +88,11 @@ def names_of(path: Path, time: str = "") -> list[str]:
     Raises:
         SourceError: If the file cannot be read as its format.
     """
-    if is_text(path):
+    form = format_of(path)
+    if form is None:
         return csv_format(path).names
     try:
-        found: list[str] = read_isolated(_names, path, time)[0]
+        found: list[str] = read_isolated(_names, path, time, form)[0]
     except SourceError as error:
         raise _about(path, error) from None
     return found
@@ -83,10 +106,11 @@ def rows_of(
     Raises:
         SourceError: If the file cannot be read, or not any further.
     """
-    if is_text(path):
-        yield from read_rows(path, time, columns)
+    form = format_of(path)
+    if form is None:
+        yield from read_rows(path, time, columns, form)
         return
-    reader = IsolatedReader(read_rows, path, time, columns)
+    reader = IsolatedReader(read_rows, path, time, columns, form)
     try:
         while not reader.ended:
             item = reader.take(timeout())
@@ -104,8 +128,8 @@ def _about(path: Path, error: SourceError) -> SourceError:
     return error if known else SourceError(f"{path}: it cannot be read ({error}); check that it is complete")
 
 
-def read_rows(path: Path, time: TimeColumn, columns: Sequence[Column]) -> Iterator[TableRows]:
-    """Yield the rows of a table in this process."""
+def read_rows(path: Path, time: TimeColumn, columns: Sequence[Column], form: TableFormat | None) -> Iterator[TableRows]:
+    """Yield the rows of a table in this process, which may know no extension; `form` is that of `format_of`."""
     problems: list[tuple[str, int, str]] = []
 
     def taken() -> tuple[tuple[str, int, str], ...]:
@@ -113,10 +137,10 @@ def read_rows(path: Path, time: TimeColumn, columns: Sequence[Column]) -> Iterat
         problems.clear()
         return found
 
-    text = is_text(path)
+    text = form is None
     if time.clock is not None and not text:
         raise SourceError(f"{path}: {time.label} are two columns, which only a CSV may have; give one column of times")
-    read: _Read = read_csv if text else _BINARY[suffix_of(path)][1]
+    read = read_csv if form is None else form.read
     times = TimeReader(time, path)
     for chunk in read(path, time.names if text else time.name, columns, lambda *problem: problems.append(problem)):
         yield dated(chunk, times, time, problems)._replace(problems=taken())
@@ -145,5 +169,5 @@ def _undated(time: TimeColumn, cell: Any) -> str:
     return f"{time.label} is {quoted(text)}, which {rule}; the row is left out: correct it, or give its unit or format"
 
 
-def _names(path: Path, time: str) -> Iterator[list[str]]:
-    yield _BINARY[suffix_of(path)][0](path, time)
+def _names(path: Path, time: str, form: TableFormat) -> Iterator[list[str]]:
+    yield form.names(path, time)

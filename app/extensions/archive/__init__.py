@@ -4,5 +4,5 @@ from config.extensions import Extension, Part
 
 EXTENSION = Extension(
     commands={"query": Part(f"{__name__}.arguments:QueryCommand", f"{__name__}.query:query")},
-    hooks={"archive": f"{__name__}.writer:archive_of"},
+    archives={"rows": Part("", f"{__name__}.writer:archive_of")},
 )

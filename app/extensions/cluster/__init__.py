@@ -4,7 +4,7 @@ from config.extensions import Extension, Part
 
 EXTENSION = Extension(
     executors={
-        "calls": Part("builtins:str", f"{__name__}.workers:dask"),
-        "folds": Part("builtins:str", f"{__name__}.executor:folds_of"),
+        "calls": Part("", f"{__name__}.workers:dask"),
+        "folds": Part("", f"{__name__}.executor:folds_of"),
     }
 )

@@ -4,5 +4,5 @@ from config.extensions import Extension, Part
 
 EXTENSION = Extension(
     commands={"serve": Part(f"{__name__}.arguments:ServeCommand", f"{__name__}.command:serve")},
-    hooks={"routes": f"{__name__}.metrics:routes"},
+    routes={"/metrics": Part("", f"{__name__}.metrics:metrics_route")},
 )

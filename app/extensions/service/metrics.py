@@ -103,14 +103,14 @@ class TwinCollector:
         yield from (alerts, waiting)
 
 
-def routes(engine: Running) -> list[BaseRoute]:
+def metrics_route(engine: Running) -> BaseRoute:
     """Return the route of the metrics of a running twin."""
 
     def metrics(states: bool = False) -> Response:
         """Answer with metrics for Prometheus; `states` adds a series per state."""
         return exposed(TwinCollector(engine, states=states))
 
-    return [get("/metrics", metrics)]
+    return get("/metrics", metrics)
 
 
 def exposed(collector: Any) -> Response:

@@ -16,7 +16,7 @@ from config.yaml_files import Key, dotted
 from estimators.errors import NisusError, SourceError
 from estimators.log import READING
 from estimators.model.state_space import Sensor, StateSpaceModel
-from sources.formats import BAG_FILE, TABLES, check_once, files_of, suffix_of
+from sources.formats import check_once, files_of, is_whole, suffix_of, tables
 
 from ..channels import channel_of, channels
 
@@ -145,15 +145,15 @@ def matching(loaded: Loaded, section: CanSection | RecordingSection, pattern: st
     if _is_recording(exact):
         return [exact]
     if exact.is_dir() and isinstance(section, TableSection) and section.follow:
-        files = [path for path in exact.iterdir() if path.is_file() and suffix_of(path) in TABLES]
+        files = [path for path in exact.iterdir() if path.is_file() and suffix_of(path) in tables()]
         return sorted(path for path in files if not path.name.startswith("."))
     escaped = wanted if os.path.isabs(wanted) else os.path.join(glob.escape(str(root)), wanted)
     return sorted(Path(match) for match in glob.glob(escaped, recursive=True) if _is_recording(Path(match)))
 
 
 def _is_recording(path: Path) -> bool:
-    """Return whether it is a file, or a folder that is a bag."""
-    return path.is_file() or (path / BAG_FILE).is_file()
+    """Return whether it is a file, or a folder that is one."""
+    return path.is_file() or is_whole(path)
 
 
 def find_databases(

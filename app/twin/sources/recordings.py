@@ -14,7 +14,7 @@ from config.yaml_files import Key
 from estimators.errors import SourceError
 from estimators.events.clocks import Passed
 from estimators.log import BEFORE, Events
-from sources.formats import TABLES, suffix_of
+from sources.formats import suffix_of, tables
 from sources.merged import MemorySource, Merged
 from sources.pieces import VALUES
 from sources.source import span_of
@@ -94,7 +94,7 @@ def _shares(opening: Opening) -> list[list[Path] | None]:
             if any(fnmatch.fnmatch(file.name, Path(pattern).name) for pattern in part.files)
         ]
         if not fits:
-            kind = TableSection if suffix_of(file) in TABLES else CanLogSection
+            kind = TableSection if suffix_of(file) in tables() else CanLogSection
             fits = [k for k, part in enumerate(section.parts) if isinstance(part, kind)]
         if len(fits) != 1:
             raise SourceError(

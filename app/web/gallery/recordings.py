@@ -13,7 +13,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from estimators.errors import ConfigError, NisusError, quoted
-from sources.formats import CAN_LOGS, TABLES, is_recording
+from sources.formats import CAN_LOGS, is_recording, tables
 
 from ...views.recording.rrd_file import Disk
 
@@ -21,8 +21,6 @@ if TYPE_CHECKING:
     from ...views.recording.reader import Facts
 
 RECORDING = ".rrd"
-LOGS = tuple(dict.fromkeys((*CAN_LOGS, *TABLES)))
-"""Suffixes of files that can replace a twin's own recording."""
 
 DATABASE = ".dbc"
 """Suffix of a file that describes the frames of CAN logs."""
@@ -161,8 +159,9 @@ class Recordings:
         """
         checked = _checked(name)
         if Path(checked).suffix.lower() not in (RECORDING, DATABASE) and not is_recording(checked):
+            logs = ", ".join(dict.fromkeys((*CAN_LOGS, *tables())))
             raise ConfigError(
-                f"{quoted(name)}: is neither a recording (.rrd), a log ({', '.join(LOGS)}, or .csv.gz) nor a "
+                f"{quoted(name)}: is neither a recording (.rrd), a log ({logs}, or .csv.gz) nor a "
                 "database (.dbc); export it as one of these"
             )
         part = self.folder / f".{checked}{PART}"

@@ -8,7 +8,7 @@ from estimators.errors import ConfigError, SourceError
 from estimators.log import READING, TRUTH
 from sources.source import Channel
 from sources.tables import binary
-from sources.tables.rows import read_rows
+from sources.tables.rows import format_of, read_rows
 from sources.tables.table import Table
 from sources.tables.times import TimeColumn
 from tests.support import read_all
@@ -37,7 +37,7 @@ def test_cells_and_vectors_come_as_they_were_saved(archive, monkeypatch):
     monkeypatch.setattr(binary, "CHUNK_VALUES", 6)  # two rows at once, so that there are several chunks
     assert len(binary.npz_names(archive)) == 12 + 3
     columns = ("t[2,1]", "one", "t[0,3]")
-    chunks = list(read_rows(archive, TimeColumn("time"), columns))
+    chunks = list(read_rows(archive, TimeColumn("time"), columns, format_of(archive)))
     assert [chunk.t.size for chunk in chunks] == [2, 2, 2, 1]
     cells = np.column_stack((FIELD[:, 2, 1], np.arange(7.0), FIELD[:, 0, 3]))
     np.testing.assert_array_equal(np.concatenate([chunk.values for chunk in chunks]), cells)

@@ -14,6 +14,7 @@ import pytest
 
 from estimators.errors import SourceError
 from estimators.log import INPUT, READING, TRUTH
+from sources import formats
 from sources.inspect import inspect_recordings
 from sources.source import UNDATED, Channel, Condition
 from sources.tables.table import Table
@@ -237,9 +238,11 @@ def test_other_marks_and_files_one_after_the_other(tmp_path):
         ("c.csv", None, "c.csv: there is no such file; check the path of the recording"),
         ("d.csv", b"", "d.csv: the file is empty; record it again"),
         ("e.parquet", b"PAR1 nonsense", "e.parquet: it cannot be read as Parquet"),
+        ("f.mcap", b"\x89MCAP0", "f.mcap: needs the extension robotics, which is not there: pip install 'nisus[r"),
     ],
 )
-def test_what_a_table_lacks_is_one_line(tmp_path, name, content, expected):
+def test_what_a_table_lacks_is_one_line(tmp_path, monkeypatch, name, content, expected):
+    monkeypatch.setattr(formats, "added", lambda kind: {})
     if content is not None:
         (tmp_path / name).write_bytes(content)
     text = error_of(SourceError, table, tmp_path / name)

@@ -8,10 +8,13 @@ import pyarrow.parquet as pq
 from rosbags.rosbag2 import Reader
 from rosbags.typesys import Stores, get_typestore
 
+from app.studies.log_overview import overview
 from app.twin.log_reader import read_log
 from app.twin.twin import load_twin
-from tests.sources.tables.bags import joints, odometry, write_folder, write_mcap
+from sources.worker_process import read_isolated
 from tests.support import folded
+
+from .bags import joints, odometry, write_folder, write_mcap
 
 START = 1_700_000_000 * 10**9
 
@@ -67,6 +70,14 @@ def test_a_bag_folds_to_the_bits_of_a_table(tmp_path, nisus):
     # Another recording in place of its own: the folder, which --log names too.
     nisus("fold", mcap, "--log", tmp_path / "drive", "--out", tmp_path / "3.parquet", "--json")
     assert same_bits(pq.read_table(tmp_path / "3.parquet"), tables[2])
+
+
+def test_a_bag_dropped_on_the_page_is_read_in_another_process(tmp_path):
+    """Which itself starts the process that reads the file."""
+    mcap, _, _ = twins(tmp_path, 50)
+    found = read_isolated(overview, mcap.with_name("drive.mcap"), None, [], None)[0]
+    figures = {one.name: (one.number, one.missing) for one in found.signals}
+    assert figures["/odom.pose.pose.position.x"] == figures["/reference.position[winding]"] == (50, 0)
 
 
 def same_bits(a, b):
@@ -130,3 +141,5 @@ def test_packages_are_missed_before_anything_is_folded(tmp_path, nisus, monkeypa
     said = nisus.refuses("fold", "motor_winding", "--out", tmp_path / "e.mcap")
     assert said == f"nisus: --out {tmp_path}/e.mcap: needs mcap and rosbags: pip install 'nisus[robotics]'"
     assert not (tmp_path / "e.mcap").exists()
+    said = nisus.refuses("fold", "lorenz63", "--out", "track.txt")
+    assert said == "nisus: --out track.txt: must end in .csv, .parquet, .mcap or .rrd"

@@ -17,11 +17,14 @@ from typing import Any
 import numpy as np
 
 from estimators.errors import SourceError
+from sources.formats import is_compressed, suffix_of
+from sources.tables.rows import TableFormat
+from sources.tables.text import CHUNK_ROWS, UNREADABLE, Chunk, Column, Problem, column_of
+from sources.worker_process import gist
 
-from ..formats import is_compressed, suffix_of
-from ..worker_process import gist
 from .message_fields import Declared, Field, Topic, topics_of
-from .text import CHUNK_ROWS, UNREADABLE, Chunk, Column, Problem, column_of
+
+ENDINGS = (".mcap", ".db3")  # Of the files of a bag
 
 TIME = "time"  # Column of the times
 
@@ -33,6 +36,26 @@ NEEDS = "a ROS 2 bag needs mcap and rosbags: pip install 'nisus[robotics]'"
 
 Messages = Callable[[Collection[str]], Iterator[tuple[str, str, int, bytes]]]
 """messages(topics): topic, type, time of recording (ns) and bytes of each message."""
+
+
+def files_in(folder: Path) -> list[Path]:
+    """Return the recordings of a folder that is a bag, in their order.
+
+    Raises:
+        SourceError: If the bag does not name its recordings, or they are compressed as files.
+    """
+    import yaml
+
+    content = folder / "metadata.yaml"
+    try:
+        info = yaml.safe_load(content.read_text(encoding="utf-8"))["rosbag2_bagfile_information"]
+        files = [folder / Path(name).name for name in info["relative_file_paths"]]
+    except (OSError, ValueError, KeyError, TypeError, yaml.YAMLError):
+        raise SourceError(f"{content}: does not list the files of the bag; name its .mcap or .db3 files") from None
+    for file in files:
+        if file.suffix not in ENDINGS:
+            raise SourceError(f"{file}: is no {' or '.join(ENDINGS)}; if it is compressed, unpack it and name the file")
+    return files
 
 
 def bag_names(path: Path, time: str = "") -> list[str]:
@@ -133,6 +156,9 @@ def read_bag(path: Path, time: str, columns: Sequence[Column], problem: Problem)
         yield chunk()
         if end:
             raise SourceError(f"{path}: {end}; check that it is complete")
+
+
+BAG = TableFormat(bag_names, read_bag, sparse=True)
 
 
 def _time(topic: Topic, message: Any, logged: int) -> int:

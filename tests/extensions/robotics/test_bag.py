@@ -8,12 +8,12 @@ import pytest
 from mcap.writer import CompressionType
 from scipy.spatial.transform import Rotation
 
+from app.extensions.robotics.bag import bag_names
 from estimators.errors import SourceError
 from estimators.log import INPUT, READING
 from sources.formats import files_of, is_recording
 from sources.inspect import inspect_recordings
 from sources.source import Accuracy, Channel, Condition
-from sources.tables.bag import bag_names
 from sources.tables.rows import names_of
 from sources.tables.table import Table
 from sources.units import heading_unit

@@ -12,14 +12,16 @@ Stamps and times of recording are those of the measurements. Needs `nisus[roboti
 from __future__ import annotations
 
 import re
+from collections.abc import Callable
 from pathlib import Path
 from typing import IO, Any
 
 import numpy as np
 
+from app.twin.twin import Twin
 from estimators.diagnostics.references import shown_track
 from estimators.errors import ConfigError
-from estimators.log import Events
+from estimators.fold import Fold
 from estimators.model.state_space import StateSpaceModel
 from estimators.smoothing.walk import Smoothed
 from estimators.track import Track
@@ -29,8 +31,8 @@ JOINT_STATE, ARRAY = "sensor_msgs/msg/JointState", "std_msgs/msg/Float64MultiArr
 NEEDS = "needs mcap and rosbags: pip install 'nisus[robotics]'"
 
 
-def check_bag(path: Path) -> None:
-    """Refuse a bag that cannot be written, before minutes of work.
+def bag_writer(path: Path) -> Callable[..., None]:
+    """Return `write_bag`; refuse a bag that cannot be written, before minutes of work.
 
     Raises:
         ConfigError: If a package is missing.
@@ -40,6 +42,7 @@ def check_bag(path: Path) -> None:
         import rosbags.typesys  # noqa: F401
     except ModuleNotFoundError:
         raise ConfigError(f"--out {path}: {NEEDS}") from None
+    return write_bag
 
 
 def covariances(model: StateSpaceModel, track: Track, pairs: np.ndarray) -> np.ndarray | None:
@@ -57,32 +60,16 @@ def covariances(model: StateSpaceModel, track: Track, pairs: np.ndarray) -> np.n
     return found if known.all() else None
 
 
-def write_bag(
-    file: IO[bytes],
-    name: str,
-    model: StateSpaceModel,
-    events: Events,
-    track: Track,
-    cov: np.ndarray | None = None,
-    smoothed: Smoothed | None = None,
-) -> None:
-    """Write the rows of a track to an open file.
-
-    Args:
-        file: Opened for writing bytes.
-        name: Of the twin, which begins the topics.
-        model: Its model, with n shown states.
-        events: Events of the N rows.
-        track: Its rows; the mean of a withheld state is NaN.
-        cov: Covariance of the shown states, (N, n, n).
-        smoothed: Smoothed rows.
-    """
+def write_bag(file: IO[bytes], twin: Twin, fold: Fold, smoothed: Smoothed | None = None) -> None:
+    """Write the rows of a fold to an open file; the mean of a withheld state is NaN."""
     from mcap.writer import Writer
     from rosbags.typesys import Stores, get_typestore
 
     store = get_typestore(Stores.LATEST)
     make: Any = store.types
-    root = re.sub(r"\W", "_", name)
+    model, track = twin.model, fold.track
+    cov = covariances(model, track, fold.pairs)
+    root = re.sub(r"\W", "_", twin.name)
     root = f"/_{root}" if root[:1].isdigit() else f"/{root}"
     writer = Writer(file)
     writer.start(profile="ros2", library="nisus")
@@ -104,7 +91,7 @@ def write_bag(
     axes = [dimension(label=label, size=n, stride=stride) for stride in (n * n, n)]
     square = make["std_msgs/msg/MultiArrayLayout"](dim=axes, data_offset=0)
     empty = np.zeros(0)
-    for k, t in enumerate(events.t.tolist()):
+    for k, t in enumerate(fold.log.events.t.tolist()):
         stamp = make["builtin_interfaces/msg/Time"](sec=t // 10**9, nanosec=t % 10**9)
         header = make["std_msgs/msg/Header"](stamp=stamp, frame_id="")
         logged = max(t, 0)  # Times of recording have no sign.

@@ -16,8 +16,7 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 from estimators.errors import SourceError
-
-from ..worker_process import gist
+from sources.worker_process import gist
 
 MAX_ELEMENTS = 64  # Elements up to which an array has a column each; longer ones are images, scans and the like
 
