@@ -138,14 +138,15 @@ def _usable(reference: str, kind: Kind, key: str) -> Any:
     return schema
 
 
-def maker(kind: Kind, key: str, asked: str = "") -> Callable[..., Any]:
-    """Return the function of a part; `asked` is what needs it.
+def maker(kind: Kind, key: str, asked: str = "", extra: str = "") -> Callable[..., Any]:
+    """Return the function of a part; `asked` is what needs it, and `extra` what brings it.
 
     Raises:
         ConfigError: If no extension has it, or it cannot be imported.
     """
     if key not in registered(kind):
-        raise ConfigError(f"{asked}: needs an extension that is not installed{left_out()}")
+        rule = f"needs an extension; install it with `pip install 'nisus[{extra}]'`"
+        raise ConfigError(f"{asked}: {rule}{left_out()}")
     name, part = registered(kind)[key]
     try:
         return pkgutil.resolve_name(part.make)

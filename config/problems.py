@@ -86,7 +86,7 @@ def _line(problem: ErrorDetails, key: Key, value: Any, places: ValuePlaces) -> s
         return f"{places.at(key)}: {dotted((*key, name))} is missing; add it"
     if kind == "unknown_key":
         stray = (*key, context["key"])
-        rule = nearest(context["key"], context["known"]) + left_out()
+        rule = nearest(context["key"], context["known"]) + (left_out() if key == ("outputs",) else "")
         return f"{places.at(stray)}: {dotted(stray)} is not known; {rule}"
     if kind == "relation":
         key = (*key, context["key"])

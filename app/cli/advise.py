@@ -157,7 +157,9 @@ def _signals_topic(every: list[Signal]) -> Topic:
                 one.kind,
                 "an angle that wraps"
                 if one.wraps
-                else "noise is its resolution" * (one.noise <= 1.01 * one.resolution / math.sqrt(12.0)),
+                else "noise is its resolution"
+                if one.noise <= 1.01 * one.resolution / math.sqrt(12.0)
+                else "",
             ),
         )
         for one in shown

@@ -9,6 +9,7 @@ import gc
 import importlib
 import inspect
 import io
+import logging
 import operator
 import os
 import re
@@ -24,7 +25,7 @@ from config.extensions import left_out, maker, schemas
 from config.yaml_files import shown_path
 from estimators.errors import ConfigError, NisusError, nearest, shown_name
 
-from ..terminal import complain
+from ..terminal import complain, use_lines_of_json
 from .arguments import COMMANDS, NAMES, RunCommand
 from .options import check_options, environment_options
 
@@ -36,11 +37,22 @@ completes words."""
 COMPLETION, SHELLS = "--tyro-print-completion", ("bash", "zsh")
 """Option of tyro, the library of the command line, and the shells for which it prints a script."""
 
+
+class Complaints(logging.Handler):
+    """Prints what the registry of extensions reports as other errors are."""
+
+    def emit(self, record: logging.LogRecord) -> None:
+        """Print a line."""
+        complain(record.getMessage())
+
+
 FULL = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG, errno.EIO)  # errors of a device that takes no more output
 
 
 def carry_out(command: Any) -> int:
     """Run one command; only its own module is imported, so that `nisus twins` answers at once."""
+    if getattr(command, "log_format", None) == "json":
+        use_lines_of_json()
     if type(command) not in COMMANDS:
         name = next(name for name, options in schemas("commands").items() if options is type(command))
         return int(maker("commands", name)(command))
@@ -110,6 +122,7 @@ def described(command: type) -> str:
 def main(arguments: Sequence[str] | None = None) -> int:
     """Entry point: 0 if all went well, 2 with one line on standard error if not."""
     given = sys.argv[1:] if arguments is None else arguments
+    logging.getLogger("nisus").handlers = [Complaints()]
     if not sys.warnoptions:
         warnings.showwarning = _show_warning
     try:

@@ -67,7 +67,9 @@ def opened_twin(
     if store is not None and store.is_dir():
         store = store / f"{twin.name}.store"
     source = live_source(twin, speed)
-    made = None if archive is None else partial(maker("archives", "rows", "--archive"), archive / twin.name, split)
+    made = None
+    if archive is not None:
+        made = partial(maker("archives", "rows", "--archive", "archive"), archive / twin.name, split)
     stamp = stamp_of(twin.files)
     return OpenedTwin(twin, source, files=twin.files, stamp=stamp, again=read, store=store, archive=made)
 

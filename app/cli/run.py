@@ -12,7 +12,7 @@ from estimators.errors import ConfigError
 
 from ..live.execute import MAX_SPEED
 from ..present.result import to_json
-from ..terminal import complain, use_lines_of_json
+from ..terminal import complain
 from ..views.recording.rrd_file import TAKEN, check_date, parse_split
 from ..web.door import check_port
 from ..web.gallery.gallery import StartRequest
@@ -47,8 +47,6 @@ def run_twin(arguments: RunCommand, workers: Sequence[Compiler] = ()) -> int:
         raise ConfigError(
             f"--speed {speed:g}: must be positive and at most {MAX_SPEED:g}, or inf for as fast as possible"
         )
-    if arguments.log_format == "json":
-        use_lines_of_json()
     record = arguments.record
     if record is not None:
         if record.suffix != ".rrd":

@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Any
 
 import numba
 
-from config.extensions import left_out, maker, registered
+from config.extensions import maker
 from estimators.compiled.orphan import leave_with_parent
 from estimators.errors import ConfigError
 
@@ -92,10 +92,7 @@ def executor_of(
 
 
 def _elsewhere(kind: str, cluster: str, *given: Any) -> AbstractContextManager[Any]:
-    if kind not in registered("executors"):
-        text = "needs an extension; install it with `pip install 'nisus[cluster]'`"
-        raise ConfigError(f"--cluster {cluster}: {text}{left_out()}")
-    found: AbstractContextManager[Any] = maker("executors", kind)(cluster, *given)
+    found: AbstractContextManager[Any] = maker("executors", kind, f"--cluster {cluster}", "cluster")(cluster, *given)
     return found
 
 

@@ -55,8 +55,6 @@ class TwinPlaces(NamedTuple):
 
 def serve(arguments: ServeCommand) -> int:
     """Run the command."""
-    if arguments.log_format == "json":
-        use_lines_of_json()
     grants = _grants(arguments)
     twins, folder = _named(arguments.twins)
     split = parse_split(arguments.archive_split, arguments.archive_keep, "--archive")

@@ -7,7 +7,7 @@ from tests.waiting import LIMIT_S
 
 PROGRAM = """
 import json, sys
-from app.cli import preloaded
+from app.extensions.service import preloaded
 from config.schema import TwinSection
 complete, before = TwinSection.__pydantic_complete__, {*sys.modules}
 from pathlib import Path
