@@ -1,5 +1,6 @@
 """Imports run one way: app → sources → estimators; config describes and may know only the errors."""
 
+from config.extensions import extensions
 from tests import ROOT
 from tests.imports import PACKAGES, edges, imported, modules
 
@@ -62,6 +63,29 @@ def circles(graph: dict[str, set[str]]) -> list[list[str]]:
         for name in free:
             del left[name]
     return [sorted(left)] if left else []
+
+
+def extension(name: str) -> str:
+    """The extension that a module, or a test, belongs to; nothing for the core."""
+    parts = name.split(".")
+    return parts[2] if parts[0] in ("app", "tests") and parts[1:2] == ["extensions"] and len(parts) > 2 else ""
+
+
+def test_an_extension_is_imported_only_by_those_that_need_it():
+    wrong = {
+        (here, there)
+        for here, to in edges().items()
+        for there in to
+        if extension(there)
+        not in ("", extension(here), *(extensions()[extension(here)].needs if extension(here) else ()))
+    }
+    assert wrong == set()
+
+
+def test_tests_of_the_core_need_no_extension():
+    core = tuple(f"tests.{package}." for package in PACKAGES)
+    found = edges(*PACKAGES, "tests").items()
+    assert {name for name, to in found if name.startswith(core) and any(map(extension, to))} == set()
 
 
 def test_no_module_imports_in_a_circle():

@@ -1,0 +1,5 @@
+"""The broker of MQTT's tests."""
+
+from tests.extensions.mqtt.conftest import broker
+
+__all__ = ["broker"]
