@@ -1,0 +1,110 @@
+"""Extensions of other packages: what they add, and what a broken one costs."""
+
+import json
+
+import pytest
+
+from tests import ROOT
+from tests.support import run_python
+
+NAME = "nisus_depth"
+
+MODULE = '''
+from typing import Literal
+
+from config.channels import ColumnSection
+from config.extensions import Extension, Part
+from config.fields import Section
+
+
+class DepthSection(Section):
+    """A depth gauge that always reads the same."""
+
+    type: Literal["depth"]
+    """depth"""
+    reading: float
+    """What it reads."""
+    sensors: dict[str, ColumnSection] = {}
+    inputs: dict[str, ColumnSection] = {}
+    truth: dict[str, ColumnSection] = {}
+
+
+def open_depth(opening):
+    from app.twin.sources.push import messages_of
+
+    messages = messages_of(opening)
+    messages.send([{"values": {messages.names[0]: opening.section.reading}, "time": 10**18}])
+    return messages
+
+
+EXTENSION = Extension(sources={"depth": Part("nisus_depth:DepthSection", "nisus_depth:open_depth")})
+'''
+
+OPENED = """
+import sys
+from app.twin.twin import load_twin
+twin = load_twin("motor_winding", overrides={"source": "{type: depth, reading: 41.5}"})
+events = twin.open_source(print).read(0.0)
+print(events.t.tolist(), events.value[:, 0].tolist())
+"""
+
+
+def installed(folder, module, *entries, name=NAME):
+    """Install a package of one module as pip does, and return its folder."""
+    info = folder / f"{name}-1.0.dist-info"
+    info.mkdir()
+    (folder / f"{name}.py").write_text(module)
+    (info / "METADATA").write_text(f"Metadata-Version: 2.1\nName: {name}\nVersion: 1.0\n")
+    (info / "entry_points.txt").write_text("\n".join(["[nisus.extensions]", *entries]))
+    return folder
+
+
+def run(monkeypatch, folder, code, **options):
+    monkeypatch.setenv("PYTHONPATH", f"{folder}:{ROOT}")
+    return run_python(code, **options)
+
+
+def test_a_package_adds_a_source(tmp_path, monkeypatch):
+    done = run(monkeypatch, installed(tmp_path, MODULE, "depth = nisus_depth:EXTENSION"), OPENED)
+    assert done.stdout == "[1000000000000000000] [41.5]\n"
+
+
+BROKEN = {
+    "import no_such_package": "ModuleNotFoundError: No module named 'no_such_package'",
+    "raise SystemExit(3)": "SystemExit: 3",
+    "EXTENSION = 1": "its entry point names no Extension",
+    "": "AttributeError: module 'nisus_depth' has no attribute 'EXTENSION'",
+    MODULE.replace("sources=", 'needs=("sonar",), sources='): "it needs the extension sonar",
+    MODULE.replace('Literal["depth"]', 'Literal["deep"]'): "TypeError: type of DepthSection is not Literal['depth']",
+    MODULE.replace("reading: float", "reading: Unknown"): "NameError: name 'Unknown' is not defined",
+    MODULE.replace("DepthSection(Section)", "DepthSection"): "TypeError: DepthSection is no config.fields.Section",
+}
+COMMANDS = """
+from app.cli.main import main
+main(['twins', 'motor_winding', '--json'])
+main(['run', 'motor_winding', '--headless', '--duration', '1', '--set', 'source={type: depth, reading: 1.0}'])
+"""
+
+
+@pytest.mark.parametrize("module", BROKEN, ids=BROKEN.values())
+def test_a_broken_one_is_a_line_and_stops_only_a_twin_that_needs_it(tmp_path, monkeypatch, module):
+    text = BROKEN[module]
+    done = run(monkeypatch, installed(tmp_path, module, "depth = nisus_depth:EXTENSION"), COMMANDS)
+    assert json.loads(done.stdout)["name"] == "motor_winding"
+    line, told = done.stderr.splitlines()
+    assert line == f"nisus: extension depth is left out: {text}"
+    assert "is 'depth'" in told and told.endswith(f"; extensions that cannot be loaded: depth ({text})")
+
+
+def test_a_function_that_cannot_be_imported_is_one_line_for_the_twin_that_asks_for_it(tmp_path, monkeypatch):
+    module = MODULE.replace("nisus_depth:open_depth", "nisus_depth:opened")
+    done = run(monkeypatch, installed(tmp_path, module, "depth = nisus_depth:EXTENSION"), COMMANDS)
+    text = "AttributeError: module 'nisus_depth' has no attribute 'opened'; install its package again"
+    assert done.stderr == f"nisus: extension depth: {text}\n"
+
+
+def test_of_two_with_one_name_the_first_by_name_counts(tmp_path, monkeypatch):
+    installed(tmp_path, MODULE, "depth = nisus_depth:EXTENSION")
+    other = MODULE.replace("nisus_depth:", "nisus_other:").replace("opening.section.reading", "-1.0")
+    done = run(monkeypatch, installed(tmp_path, other, "other = nisus_other:EXTENSION", name="nisus_other"), OPENED)
+    assert done.stdout == "[1000000000000000000] [41.5]\n"
