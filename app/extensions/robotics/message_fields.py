@@ -11,6 +11,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Sequence
+from io import BytesIO
 from operator import attrgetter, getitem
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -126,9 +127,9 @@ def _types(one: Declared) -> Any:
 def _decoder(store: Any, kind: str) -> Callable[[bytes], Any]:
     def decode(data: bytes) -> Any:
         if data[:4] == ZSTD:
-            import zstandard
+            import pyarrow  # Here, not above: it takes long, and most messages are not compressed.
 
-            data = zstandard.decompress(data)
+            data = pyarrow.input_stream(BytesIO(data), compression="zstd").read()
         return store.deserialize_cdr(data, kind)
 
     return decode

@@ -6,7 +6,7 @@ from typing import Any
 import numpy as np
 from mcap.writer import CompressionType
 from mcap.writer import Writer as McapWriter
-from rosbags.rosbag2 import StoragePlugin, Writer
+from rosbags.rosbag2 import CompressionFormat, CompressionMode, StoragePlugin, Writer
 from rosbags.typesys import Stores, get_typestore
 
 STORE = get_typestore(Stores.ROS2_HUMBLE)
@@ -62,10 +62,13 @@ def odometry(t: int, x: float, speed: float, variance: float) -> Any:
     )  # fmt: skip
 
 
-def write_folder(path: Path, messages: Messages, storage: str = "mcap") -> Path:
-    """Write a folder as `ros2 bag record` does; return it."""
+def write_folder(path: Path, messages: Messages, storage: str = "mcap", *, packed: bool = False) -> Path:
+    """Write a folder as `ros2 bag record` does, with each message compressed if `packed`; return it."""
     plugin = StoragePlugin.MCAP if storage == "mcap" else StoragePlugin.SQLITE3
-    with Writer(path, version=9, storage_plugin=plugin) as writer:
+    writer = Writer(path, version=9, storage_plugin=plugin)
+    if packed:
+        writer.set_compression(CompressionMode.MESSAGE, CompressionFormat.ZSTD)
+    with writer:
         known: dict[str, Any] = {}
         for topic, t, message in messages:
             kind = message.__msgtype__

@@ -29,6 +29,7 @@ RECORDED = 7_000_000  # ns between the stamp of a message and its recording
 WAYS = {
     "folder.mcap": lambda path, messages: files_of(write_folder(path / "drive", messages)),
     "folder.db3": lambda path, messages: files_of(write_folder(path / "drive", messages, "sqlite3")),
+    "packed.db3": lambda path, messages: files_of(write_folder(path / "drive", messages, "sqlite3", packed=True)),
     "file.mcap": lambda path, messages: [write_mcap(path / "drive.mcap", messages)],
     "raw.mcap": lambda path, messages: [write_mcap(path / "raw.mcap", messages, compression=CompressionType.NONE)],
 }
