@@ -18,6 +18,7 @@ from ..formats import CAN_LOGS, check_present, is_compressed, suffix_of
 from ..source import NEVER, TRUNCATED, Recorded, Report, ignore
 from ..units import second_ns
 from ..worker_process import IsolatedReader, read_isolated
+from . import check_mf4
 from .decoder import Decoder
 from .mf4 import mf4_span, read_mf4
 from .readers import BusName, LogSummary, Raw, open_reader, read_messages, unreadable
@@ -103,7 +104,7 @@ def check_log(path: Path) -> None:
     """Refuse a file that cannot be read.
 
     Raises:
-        SourceError: If the file is missing, empty, or of no known format.
+        SourceError: If the file is missing, empty, or of no known format, or the package that reads it is missing.
     """
     check_present(path)
     if suffix_of(path) not in CAN_LOGS or (is_compressed(path) and path.suffix.lower() != ".gz"):
@@ -114,6 +115,7 @@ def check_log(path: Path) -> None:
         with path.open("rb") as file:
             if file.read(3) not in (b"MDF", b"UnF"):
                 raise SourceError(f"{path}: it cannot be read as MF4; check that it is one")
+        check_mf4(path)
         return
     open_reader(path).stop()
 

@@ -3,6 +3,7 @@
 import gzip
 import re
 import shutil
+import sys
 import threading
 
 import can
@@ -174,6 +175,14 @@ def test_a_file_that_is_no_log_is_one_line(tmp_path, capfd, name, content, expec
     text = error_of(SourceError, lambda: read_all(CanLog([path], decoder_of(tmp_path))))
     assert text.startswith(f"{path}: {expected}")
     assert "Traceback" not in capfd.readouterr().err
+
+
+def test_without_asammdf_an_mf4_file_names_its_extra(tmp_path, monkeypatch):
+    monkeypatch.setitem(sys.modules, "asammdf", None)
+    path = tmp_path / "a.mf4"
+    path.write_bytes(b"MDF     4.10    " + bytes(400))
+    for use in (lambda: CanLog([path], decoder_of(tmp_path)), lambda: log_writer(path)):
+        assert error_of(SourceError, use) == f"{path}: MF4 needs asammdf: pip install 'nisus[mf4]'"
 
 
 @pytest.mark.parametrize("suffix", [".db", ".blf", ".log"])
