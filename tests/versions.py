@@ -91,7 +91,7 @@ def attempt(python: str, resolution: str, tests: list[str]) -> int:
         ]
         steps = (
             [*uv, "venv", "--python", python, str(venv)],
-            [*uv, "pip", "install", "--python", inside, "--resolution", resolution, "-e", f"{ROOT}[dev]"],
+            [*uv, "pip", "install", "--python", inside, "--resolution", resolution, "-e", f"{ROOT}[test-all]"],
             [*run, *tests],
         )
         for step in steps:
