@@ -1,0 +1,27 @@
+"""The wheel has every file of the packages, whatever `package-data` of pyproject.toml says."""
+
+import shutil
+import subprocess
+import sys
+from zipfile import ZipFile
+
+from tests import ROOT
+from tests.imports import PACKAGES
+
+
+def test_the_wheel_has_all_files_of_the_packages(tmp_path):
+    """As git lists them; `py.typed` tells type checkers that a package has types. Pictures are the guides'."""
+    git = ["git", "ls-files", "-z", "--cached", "--others", "--exclude-standard"]
+    listed = subprocess.run(git, cwd=ROOT, capture_output=True, text=True, check=True).stdout.split("\0")
+    names = [name for name in listed if name and (ROOT / name).is_file() and not name.startswith("tests/")]
+    copy = tmp_path / "copy"
+    for name in names:
+        (copy / name).parent.mkdir(parents=True, exist_ok=True)
+        shutil.copy(ROOT / name, copy / name)
+    build = [sys.executable, "-m", "pip", "wheel", "-q", "--no-deps", "--no-index", "--no-build-isolation"]
+    subprocess.run([*build, "-w", tmp_path, copy], check=True)
+    with ZipFile(next(tmp_path.glob("*.whl"))) as file:
+        packed = set(file.namelist())
+    wanted = {name for name in names if name.startswith(tuple(f"{package}/" for package in PACKAGES))}
+    assert {f"{package}/py.typed" for package in PACKAGES} <= wanted
+    assert sorted(name for name in wanted - packed if not name.startswith("config/pictures/")) == []
