@@ -15,7 +15,7 @@ from app.cli.main import main, parse
 from config.loader import find
 from tests import ROOT
 
-GUIDES = sorted([ROOT / "README.md", *(ROOT / "docs").glob("*.md")])
+GUIDES = sorted([*ROOT.glob("*.md"), *(ROOT / "docs").glob("*.md")])
 PATH_OF_NISUS = os.pathsep.join([str(Path(sys.executable).parent), os.environ.get("PATH", "")])
 
 
