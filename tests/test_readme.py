@@ -1,11 +1,12 @@
 """The README's Python runs as it is printed, and its commands exist."""
 
 import re
-from pathlib import Path
 
 import numpy as np
 
-README = (Path(__file__).parent.parent / "README.md").read_text(encoding="utf-8")
+from tests import ROOT
+
+README = (ROOT / "README.md").read_text(encoding="utf-8")
 
 
 def test_python_of_the_readme_runs(capsys):
@@ -23,7 +24,19 @@ def test_python_of_the_readme_runs(capsys):
     assert "temperature_std" in capsys.readouterr().out
 
 
+def test_the_notice_names_every_picture_of_a_recording():
+    """A twin of a recording gives its files; its pictures bear its name."""
+    config = ROOT / "config"
+    recorded = [
+        path.stem for path in config.glob("twins/*.yaml") if re.search(r"^ +files: ", path.read_text(), re.MULTILINE)
+    ]
+    pictures = [path for folder in ("cards", "pictures") for path in (config / folder).iterdir()]
+    named = re.findall(r"`([^`]+)`", (ROOT / "NOTICE.md").read_text(encoding="utf-8"))
+    made = {str(path.relative_to(ROOT)) for path in pictures if path.stem in recorded}
+    assert len(made) > 8 and made - set(named) == set()
+
+
 def test_pictures_of_the_readme_are_there():
     pictures = re.findall(r"!\[[^\]]*\]\(([^)]+)\)", README)
     assert len(pictures) == 2
-    assert all((Path(__file__).parent.parent / picture).stat().st_size > 10_000 for picture in pictures)
+    assert all((ROOT / picture).stat().st_size > 10_000 for picture in pictures)
