@@ -124,3 +124,15 @@ class ColumnSection(ChannelSection):
     def names(self) -> tuple[str, ...]:
         """Return the columns, one a row."""
         return self.columns
+
+
+class MessagesSection(Section):
+    """A source of messages with values by name, which other programs, a broker, a server or a device send."""
+
+    sensors: dict[str, ColumnSection] = {}
+    """Sensors of the model and the names of the values that feed them. Default, without any sensor and input: all of
+    them, by the names of the model."""
+    inputs: dict[str, ColumnSection] = {}
+    """Inputs of the model and the names of the values that feed them."""
+    truth: dict[str, ColumnSection] = {}
+    """States whose true value is sent too. They are scored, never used."""

@@ -20,6 +20,7 @@ from typing import Any, Literal, NamedTuple, TypeVar, get_args
 
 from estimators.errors import ConfigError, printable, reason_of
 
+from .channels import MessagesSection
 from .fields import Section
 
 GROUP = "nisus.extensions"
@@ -72,11 +73,14 @@ class Extension:
     between its `start` and `stop`."""
     routes: Parts = field(default_factory=dict)
     """Routes beside those of the page, by path. `make(engine)` returns one, as `app.web.http.get` does."""
+    panels: Parts = field(default_factory=dict)
+    """Tabs of the page, by title. `make()` returns a JavaScript module, whose default export is called with the element
+    of the tab and what the page has: `{model, link, view, charts}` (`app/web/page/page.js`)."""
 
 
 Kind = Literal[
     "commands", "sources", "outputs", "receivers", "models", "executors", "tables", "folders", "tracks", "archives",
-    "routes",
+    "routes", "panels",
 ]  # fmt: skip
 TAGGED = ("sources", "receivers")
 """Kinds of which a section is recognised by its `type`, a literal that is the name of the part."""
@@ -128,8 +132,9 @@ def _usable(reference: str, kind: Kind, key: str) -> Any:
     """Return a class of options or sections; one that would stop every twin is refused."""
     schema = pkgutil.resolve_name(reference)
     if kind != "commands":
-        if not issubclass(schema, Section):
-            raise TypeError(f"{schema.__name__} is no config.fields.Section")
+        base = MessagesSection if kind == "sources" else Section
+        if not issubclass(schema, base):
+            raise TypeError(f"{schema.__name__} is no {base.__name__}")
         schema.model_rebuild()
         if kind in TAGGED and get_args(schema.model_fields["type"].annotation) != (key,):
             raise TypeError(f"type of {schema.__name__} is not Literal[{key!r}]")

@@ -10,7 +10,7 @@ from pydantic import AfterValidator, BeforeValidator, Field, model_validator
 
 from estimators.errors import nearest
 
-from .channels import ColumnSection, SignalSection
+from .channels import ColumnSection, MessagesSection, SignalSection
 from .extensions import schemas
 from .fields import (
     MAX_DURATION_S,
@@ -265,18 +265,11 @@ class TableSection(RecordingSection):
     with a cell for each of its own; cells that a sensor reads are left out."""
 
 
-class PushSection(Section):
+class PushSection(MessagesSection):
     """Messages that other programs send, with POST /api/readings or `nisus push`."""
 
     type: Literal["push"]
     """push"""
-    sensors: dict[str, ColumnSection] = {}
-    """Sensors of the model and the names of the values that feed them. Default, without any sensor and input: all of
-    them, by the names of the model."""
-    inputs: dict[str, ColumnSection] = {}
-    """Inputs of the model and the names of the values that feed them."""
-    truth: dict[str, ColumnSection] = {}
-    """States whose true value is sent too. They are scored, never used."""
 
 
 PartSection = Annotated[CanLogSection | TableSection, Field(discriminator="type")]

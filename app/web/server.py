@@ -20,7 +20,7 @@ from starlette.routing import BaseRoute, Mount, Route, WebSocketRoute
 from starlette.staticfiles import StaticFiles
 from starlette.websockets import WebSocket
 
-from config.extensions import makers
+from config.extensions import maker, makers, registered
 from estimators.errors import ConfigError, NisusError
 
 from ..live.engine import STATUS_PERIOD_S
@@ -180,6 +180,7 @@ class PageServer:
             get("/api/scene", self._scene),
             post("/api/scene", self._choose),
             get("/api/recordings", self._list_recordings),
+            get("/panels/{title}", self._panel, refused=404),
             get("/rec/{name}", self._recording),
             Route(f"/viewer/{viewer_version()}/{{name}}", self._viewer_file),
             WebSocketRoute("/api/stream", self._page_stream),
@@ -198,7 +199,11 @@ class PageServer:
         settings = {"viewer": f"viewer/{viewer_version()}", "boot": self._boot, "viser": self._viser is not None}
         settings |= {"charts": CHART_FILES, "gallery": self.door.has_gallery, "stage_pass": self.door.stage_pass}
         settings |= {"overview": self.door.overview}
-        return page_file(name, settings)
+        return page_file(name, settings | {"panels": list(registered("panels"))})
+
+    def _panel(self, title: str) -> Response:
+        """Answer with the script of a tab that an extension adds."""
+        return Response(maker("panels", title)(), media_type="text/javascript")
 
     def _index(self) -> Response:
         """Answer with the page."""

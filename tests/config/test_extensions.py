@@ -12,21 +12,17 @@ NAME = "nisus_depth"
 MODULE = '''
 from typing import Literal
 
-from config.channels import ColumnSection
+from config.channels import MessagesSection
 from config.extensions import Extension, Part
-from config.fields import Section
 
 
-class DepthSection(Section):
+class DepthSection(MessagesSection):
     """A depth gauge that always reads the same."""
 
     type: Literal["depth"]
     """depth"""
     reading: float
     """What it reads."""
-    sensors: dict[str, ColumnSection] = {}
-    inputs: dict[str, ColumnSection] = {}
-    truth: dict[str, ColumnSection] = {}
 
 
 def open_depth(opening):
@@ -77,7 +73,7 @@ BROKEN = {
     MODULE.replace("sources=", 'needs=("sonar",), sources='): "it needs the extension sonar",
     MODULE.replace('Literal["depth"]', 'Literal["deep"]'): "TypeError: type of DepthSection is not Literal['depth']",
     MODULE.replace("reading: float", "reading: Unknown"): "NameError: name 'Unknown' is not defined",
-    MODULE.replace("DepthSection(Section)", "DepthSection"): "TypeError: DepthSection is no config.fields.Section",
+    MODULE.replace("DepthSection(MessagesSection)", "DepthSection"): "TypeError: DepthSection is no MessagesSection",
 }
 COMMANDS = """
 from app.cli.main import main

@@ -15,9 +15,9 @@ from urllib.request import HTTPSHandler, ProxyHandler, Request, build_opener, ur
 import pytest
 from websockets.sync.client import connect
 
-from app.cli.arguments import ServeCommand
 from app.cli.main import parse
 from app.cli.options import environment_options
+from app.extensions.service.arguments import ServeCommand
 from tests import ROOT
 from tests.extensions.service.test_service import Served, all_run
 from tests.skips import program

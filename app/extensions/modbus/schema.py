@@ -6,7 +6,7 @@ from typing import Annotated, Any, Literal
 
 from pydantic import BeforeValidator, Field, model_validator
 
-from config.channels import ColumnSection
+from config.channels import MessagesSection
 from config.fields import Host, Port, Seconds, Section, Text, refused
 
 
@@ -33,7 +33,7 @@ def _register(value: Any) -> Any:
     return {"address": value} if isinstance(value, int) else value
 
 
-class ModbusSourceSection(Section):
+class ModbusSourceSection(MessagesSection):
     """Registers of a Modbus TCP device, read again and again."""
 
     type: Literal["modbus"]
@@ -54,9 +54,3 @@ class ModbusSourceSection(Section):
         Field(min_length=1),
     ]
     """Registers by the names of their values: {LT101: {address: 100, type: float32}, FT101: 102}."""
-    sensors: dict[str, ColumnSection] = {}
-    """Sensors of the model and the names of the values that feed them. Default: all, by the model's names."""
-    inputs: dict[str, ColumnSection] = {}
-    """Inputs of the model and the names of the values that feed them."""
-    truth: dict[str, ColumnSection] = {}
-    """States whose true value the device has too. They are scored, never used."""

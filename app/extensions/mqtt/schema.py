@@ -6,7 +6,7 @@ from typing import Annotated, Any, Literal
 
 from pydantic import BeforeValidator, Field
 
-from config.channels import ColumnSection
+from config.channels import MessagesSection
 from config.fields import EnvironmentName, Host, Port, Section, Text, as_list
 
 ASSET_LEVEL = "{asset}"
@@ -55,7 +55,7 @@ class BrokerSection(Section):
     """Certificate of the authority that signed the broker's, for TLS. Default: none, no encryption."""
 
 
-class MqttSourceSection(BrokerSection):
+class MqttSourceSection(BrokerSection, MessagesSection):
     """Topics of an MQTT broker."""
 
     type: Literal["mqtt"]
@@ -73,12 +73,6 @@ class MqttSourceSection(BrokerSection):
     """Quality of service. Default: 1."""
     client_id: Text | None = None
     """Name of the session, under which the broker keeps messages while the twin is away. Default: none, it does not."""
-    sensors: dict[str, ColumnSection] = {}
-    """Sensors of the model and the names of the values that feed them. Default: all, by the model's names."""
-    inputs: dict[str, ColumnSection] = {}
-    """Inputs of the model and the names of the values that feed them."""
-    truth: dict[str, ColumnSection] = {}
-    """States whose true value is sent too. They are scored, never used."""
 
 
 class MqttSection(BrokerSection):

@@ -6,11 +6,11 @@ from typing import Annotated, Literal
 
 from pydantic import Field, model_validator
 
-from config.channels import ColumnSection
+from config.channels import MessagesSection
 from config.fields import EnvironmentName, Host, Port, Seconds, Section, Text, refused
 
 
-class OpcUaSourceSection(Section):
+class OpcUaSourceSection(MessagesSection):
     """Nodes of an OPC UA server, by subscription."""
 
     type: Literal["opcua"]
@@ -21,12 +21,6 @@ class OpcUaSourceSection(Section):
     """Node ids by the names of their values: {LT101: "ns=2;s=Tank.Level"}."""
     every: Seconds = 0.1
     """Publishing interval, s. Default: 0.1."""
-    sensors: dict[str, ColumnSection] = {}
-    """Sensors of the model and the names of the values that feed them. Default: all, by the model's names."""
-    inputs: dict[str, ColumnSection] = {}
-    """Inputs of the model and the names of the values that feed them."""
-    truth: dict[str, ColumnSection] = {}
-    """States whose true value the server has too. They are scored, never used."""
 
 
 class OpcUaSection(Section):

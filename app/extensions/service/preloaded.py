@@ -23,9 +23,9 @@ from config.schema import TwinSection
 from sources import pacer
 from sources.tables import table
 
-from . import command
+from . import command, metrics
 
-__all__ = ["command", "open_twin", "pacer", "rows", "server", "table", "view"]
+__all__ = ["command", "metrics", "open_twin", "pacer", "rows", "server", "table", "view"]
 
 cpu_target.typing_context.refresh()
 cpu_target.target_context.refresh()

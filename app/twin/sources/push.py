@@ -6,7 +6,7 @@ from collections.abc import Callable, Iterable
 from dataclasses import replace
 from typing import TYPE_CHECKING, Any
 
-from config.channels import ColumnSection
+from config.channels import ColumnSection, MessagesSection
 from config.yaml_files import Key
 from estimators.errors import nearest
 from estimators.model.state_space import StateSpaceModel
@@ -38,7 +38,7 @@ def messages_of(opening: Opening, key: str = "", named: Iterable[str] = ()) -> M
     return messages
 
 
-def with_channels(section: Any, model: StateSpaceModel) -> Any:
+def with_channels(section: MessagesSection, model: StateSpaceModel) -> MessagesSection:
     """Return a section with its channels; of one without any, all sensors and inputs by their own names."""
     if _sections(section, ()):
         return section
@@ -51,7 +51,7 @@ def with_channels(section: Any, model: StateSpaceModel) -> Any:
     return section.model_copy(update={"sensors": sensors, "inputs": inputs})
 
 
-def _sections(section: Any, key: Key) -> dict[Key, Any]:
+def _sections(section: MessagesSection, key: Key) -> dict[Key, Any]:
     return {key: section} if section.sensors or section.inputs or section.truth else {}
 
 

@@ -70,6 +70,15 @@ window.nisus.view = view;
 // Scenes about as wide as high; one of many cells is not.
 const square = model.field || ["belief", "gripper"].includes(model.scene) || (model.scene === "battery" && model.states.length < 8);
 setAttribute($("right"), "data-square", String(square));
+settings.panels.forEach((title, k) => {
+  $("side-tabs").append(element("button", { type: "button", "data-tab": `panel-${k}` }, title));
+  const node = element("div", { id: `panel-${k}`, role: "tabpanel", hidden: "" });
+  $("right").append(node);
+  import(new URL(`panels/${encodeURIComponent(title)}`, document.baseURI)).then(
+    (script) => script.default(node, window.nisus),
+    (error) => node.append(element("p", { class: "warning" }, `${title}: ${error.message}`)),
+  );
+});
 const side = new Tabs($("side-tabs"), "nisus.side");
 new Trust(model, link, (tab) => side.show(tab));
 const tune = (window.nisus.tune = new Tune(model, link));
