@@ -8,6 +8,7 @@ from dataclasses import dataclass, replace
 from functools import lru_cache
 from pathlib import Path
 
+from config.channels import MessagesSection
 from config.loader import TWINS, Loaded, find, load, shipped
 from config.tunings import ships
 from estimators.errors import NisusError
@@ -26,8 +27,8 @@ def picture_file(twin: Path) -> Path:
     return CARDS / f"{twin.stem}.svg" if ships(twin) else twin.with_suffix(".svg")
 
 
-KINDS = {"simulator": "simulated", "can": "CAN bus", "push": "messages"}
-"""Names of source types on a card; any other type is recorded."""
+KINDS = {"simulator": "simulated", "can": "CAN bus"}
+"""Names of source types on a card; any other is of messages, or recorded."""
 
 
 @dataclass(frozen=True)
@@ -92,7 +93,7 @@ def card_of(name: str, twin: Twin) -> Card:
         title=twin.title,
         question=config.question,
         teaches=config.teaches,
-        source=KINDS.get(config.source.type, "recorded"),
+        source=KINDS.get(config.source.type, "messages" if isinstance(config.source, MessagesSection) else "recorded"),
         states=twin.model.nx,
         rows=len(twin.model.row_names),
         estimator=twin.estimator,

@@ -21,8 +21,6 @@ class UdpSourceSection(MessagesSection):
 
 
 class UdpSource:
-    """Takes datagrams in a thread of its own."""
-
     live = utc = True
 
     def __init__(self, opening):
@@ -46,8 +44,7 @@ class UdpSource:
             if reason:
                 self._report("datagram refused", f"udp: {reason}")
 
-    def close(self):
-        """End the thread, with an empty datagram."""
+    def close(self):  # the empty datagram ends the thread
         self._socket.sendto(b"", self._socket.getsockname())
 
 
@@ -55,14 +52,10 @@ class UdpSection(Section):
     """Receiver of the state: {host, port}."""
 
     host: Host
-    """Its name or address."""
     port: Port
-    """Its port."""
 
 
 class UdpOutput:
-    """Sends each state as one datagram."""
-
     name = "udp"
 
     def __init__(self, section, engine, secrets):
@@ -73,12 +66,10 @@ class UdpOutput:
         self.start, self.stop = lambda: None, self._socket.close
 
     def publish(self, message):
-        """Send a state."""
         self._socket.sendto(message.model_dump_json().encode(), self._address)
 
 
 def panel():
-    """Return the script of the tab."""
     return """export default (tab, { link }) => link.addEventListener("status", async () => {
       const { states } = await (await fetch("api/state")).json();
       tab.replaceChildren(...states.map(({ name, value, unit }) => `${name} ${value?.toFixed(2)} ${unit} `));
