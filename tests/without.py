@@ -28,7 +28,7 @@ COMMANDS = (
     "review drive.rrd --duration 1 --no-browser --port 0",
     "fold motor_can --duration 10",
     "compare motor_winding --duration 10 --estimators kf ekf --jobs 1",
-    "tune motor_winding --duration 60",
+    "tune motor_winding --duration 60 --set R.winding=40",
     "check motor_winding --duration 10",
     "new pump",
     "fold motor_winding --duration 60 --out drive.csv",
@@ -70,7 +70,7 @@ def tried(copy: Path, command: list[str], told: set[str]) -> str:
     done = subprocess.run([sys.executable, "-m", *command], cwd=copy, env=variables, capture_output=True, text=True)
     if done.returncode:
         return f"{' '.join(command)}: ended with {done.returncode}\n{done.stdout[-2000:]}{done.stderr[-2000:]}"
-    lines = [line.split()[1] for line in done.stderr.splitlines() if line.startswith("extension ")]
+    lines = [line.split()[2] for line in done.stderr.splitlines() if line.startswith("nisus: extension ")]
     return "" if sorted(lines) == sorted(told) else f"{' '.join(command)}: tells of {lines}, not of {sorted(told)}"
 
 

@@ -9,7 +9,6 @@ from contextlib import suppress
 import numba
 import pytest
 
-from app.studies import processes
 from app.studies.processes import executor_of, jobs_of, results
 from config import extensions
 from estimators.errors import ConfigError
@@ -91,7 +90,7 @@ def test_a_cluster_has_processes_of_its_own():
     [lambda: list(results(handled, [()], cluster="local:2")), lambda: executor_of("local:2", None, None, "", {})],
 )
 def test_a_cluster_without_its_extension_is_one_line(work, monkeypatch):
-    monkeypatch.setattr(processes, "registered", lambda kind: {})
+    monkeypatch.setattr(extensions, "registered", lambda kind: {})
     monkeypatch.setitem(extensions._left_out, "dask", "no module")
     text = r"^--cluster local:2: needs an extension; .*'nisus\[cluster\]'`; ext.* loaded: .*\bdask \(no module\)$"
     with pytest.raises(ConfigError, match=text):
