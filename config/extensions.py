@@ -71,6 +71,9 @@ class Extension:
     archives: Parts = field(default_factory=dict)
     """Of `--archive`: `rows`. `make(folder, split, engine, stored)` returns what archives the rows of a running twin
     between its `start` and `stop`."""
+    pictures: Parts = field(default_factory=dict)
+    """Drawn without a browser. `track`: `make(path)` returns what draws one, as `app.extensions.plot.track.plot_track`,
+    or refuses; `twin`: `make(name)` draws that of the gallery, and returns its path."""
     routes: Parts = field(default_factory=dict)
     """Routes beside those of the page, by path. `make(engine)` returns one, as `app.web.http.get` does."""
     panels: Parts = field(default_factory=dict)
@@ -80,7 +83,7 @@ class Extension:
 
 Kind = Literal[
     "commands", "sources", "outputs", "receivers", "models", "executors", "tables", "folders", "tracks", "archives",
-    "routes", "panels",
+    "pictures", "routes", "panels",
 ]  # fmt: skip
 TAGGED = ("sources", "receivers")
 """Kinds of which a section is recognised by its `type`, a literal that is the name of the part."""

@@ -60,9 +60,7 @@ def fold_twin(arguments: Arguments) -> int:
     if out is not None and recorded and os.path.lexists(out):
         raise ConfigError(f"--out {out}: {TAKEN}")
     if arguments.plot is not None:
-        from ..present.drawing.plot import check_plot, plot_track
-
-        check_plot(arguments.plot)
+        plot_track = maker("pictures", "track", "--plot", "plot")(arguments.plot)
     if arguments.smooth:
         from estimators.smoothing.smooth import check_smooth, smooth
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 from itertools import takewhile
 from typing import TYPE_CHECKING, Any
 
-from config.yaml_files import TWINS, parse, read_text, shipped, shown_path, writing
+from config.yaml_files import TWINS, parse, read_text, shipped, shown_path
 
 if TYPE_CHECKING:
     from config.loader import Loaded
@@ -21,12 +21,14 @@ def show_twins(arguments: Arguments) -> int:
             data, _ = parse(read_text(path, "nisus twins"), shown_path(path))
             print(f"{name:<16} {data.get('title', '')}")
         return 0
+    from config.extensions import maker
     from config.loader import load
 
     from ..present.result import to_json
 
     if arguments.picture:
-        drawn = [_draw(name) for name in (shipped() if arguments.name is None else [arguments.name])]
+        draw = maker("pictures", "twin", "--picture", "plot")
+        drawn = [draw(name) for name in (shipped() if arguments.name is None else [arguments.name])]
         print(to_json(drawn) if arguments.json else "\n".join(drawn))
         return 0
     if arguments.name is not None:
@@ -71,29 +73,6 @@ def _prose(loaded: Loaded) -> list[str]:
     """Return the leading comment of the YAML."""
     head = takewhile(lambda line: line.startswith("#"), loaded.text.splitlines())
     return [line.removeprefix("#").removeprefix(" ") for line in head]
-
-
-def _draw(name: str) -> str:
-    """Draw the gallery picture of a twin from its log, and return its path."""
-    from config.loader import find
-
-    from ..present.drawing.card import picture_of
-    from ..twin.log_reader import read_log
-    from ..twin.twin import load_twin
-    from ..web.gallery.cards import picture_file
-    from .prepare import prepare
-
-    twin = load_twin(name)
-    prepare(twin)
-    # A part of an endless or long simulation is enough.
-    duration = 10.0 * twin.config.view.window if twin.config.source.type == "simulator" else None
-    log, _ = read_log(twin, duration)
-    path = picture_file(find(name))
-    picture = picture_of(twin, log)
-    with writing(path):
-        path.parent.mkdir(exist_ok=True)
-        path.write_text(picture, encoding="utf-8")
-    return shown_path(path)
 
 
 def described(loaded: Loaded) -> list[str]:

@@ -362,10 +362,10 @@ class Estimates:
         """Return a `matplotlib.figure.Figure` of states with ± 2 σ, innovations and NIS; `.savefig(path)` writes it.
 
         Raises:
-            ConfigError: If Matplotlib is not installed.
+            ConfigError: If Matplotlib, or the extension that draws, is not installed.
         """
         # By name, as pandas loads its plotting backend: the numerics depend neither on the application nor Matplotlib.
-        draw = import_module("app.present.drawing.plot").plot_track
+        draw = import_module("config.extensions").maker("pictures", "track", "track.plot()", "plot")()
         heading = title or f"{self.model.name}, {self.estimator}"
         return draw(self.model, self.events, self.track, episodes=self.episodes(), title=heading)
 

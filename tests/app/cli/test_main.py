@@ -12,7 +12,7 @@ import pytest
 
 from app.cli import arguments
 from app.cli.main import described, main, parse
-from config.extensions import maker, schemas
+from config.extensions import maker, registered, schemas
 from config.loader import shipped
 from tests import ROOT
 from tests.cases import cases
@@ -25,6 +25,16 @@ needs_full = pytest.mark.skipif(not FULL.exists(), reason="there is no /dev/full
 
 def test_twins_are_listed_without_numba():
     run_python("import sys; from app.cli.main import main; main(['twins']); assert 'numba' not in sys.modules")
+
+
+@pytest.mark.parametrize(
+    ("words", "option", "picture"),
+    [("fold motor_winding --plot run.png", "--plot", "track"), ("twins motor_winding --picture", "--picture", "twin")],
+)
+def test_a_picture_without_its_extension_names_the_extra(words, option, picture, nisus, monkeypatch):
+    monkeypatch.delitem(registered("pictures"), picture, raising=False)
+    line = f"nisus: {option}: needs an extension; install it with `pip install 'nisus[plot]'`"
+    assert nisus.refuses(*words.split()).startswith(line)
 
 
 @pytest.mark.parametrize("name", NAMES)

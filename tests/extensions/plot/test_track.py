@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from app.cli.main import main
-from app.present.drawing.plot import TrackSeries, check_plot, draw_state, new_figure, plot_track, time_unit
+from app.extensions.plot.track import TrackSeries, draw_state, new_figure, plot_track, plotter, time_unit
 from estimators import MODELS, Log, fold
 from estimators.errors import ConfigError
 from estimators.track import USED
@@ -119,7 +119,7 @@ def test_another_ending_and_a_missing_matplotlib_are_one_line(tmp_path, monkeypa
     assert ".png" in capsys.readouterr().err
     monkeypatch.setitem(sys.modules, "matplotlib.figure", None)
     with pytest.raises(ConfigError, match=r"nisus\[plot\]"):
-        check_plot(tmp_path / "run.png")
+        plotter(tmp_path / "run.png")
 
 
 @pytest.mark.parametrize(

