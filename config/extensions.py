@@ -72,8 +72,8 @@ class Extension:
     """Of `--archive`: `rows`. `make(folder, split, engine, stored)` returns what archives the rows of a running twin
     between its `start` and `stop`."""
     pictures: Parts = field(default_factory=dict)
-    """Drawn without a browser. `track`: `make(path)` returns what draws one, as `app.extensions.plot.track.plot_track`,
-    or refuses; `twin`: `make(name)` draws that of the gallery, and returns its path."""
+    """Drawn without a browser. `track`: `make(path)` returns `draw(model, events, track, episodes, title)`, which makes
+    the figure to save there, or refuses; `twin`: `make(name)` draws that of the gallery, and returns its path."""
     routes: Parts = field(default_factory=dict)
     """Routes beside those of the page, by path. `make(engine)` returns one, as `app.web.http.get` does."""
     panels: Parts = field(default_factory=dict)
