@@ -1,4 +1,4 @@
-"""Receivers of alerts: web hooks, e-mail and programs, and the queue of each.
+"""Receivers of alerts: web hooks and those of extensions, and the queue of each.
 
 Each receiver has a queue and takes its alerts in a thread of its own pool, so that a dead one delays neither the twin
 nor the others.
@@ -9,17 +9,12 @@ from __future__ import annotations
 import hashlib
 import hmac
 import math
-import smtplib
 import socket
-import ssl
-import subprocess
-import tempfile
 import threading
 import time
 from collections import deque
 from collections.abc import Mapping, Sequence
 from contextlib import suppress
-from email.message import EmailMessage
 from functools import partial
 from http.client import HTTPConnection, HTTPSConnection
 from pathlib import Path
@@ -28,8 +23,7 @@ from urllib.error import HTTPError, URLError
 from urllib.request import HTTPHandler, HTTPRedirectHandler, HTTPSHandler, Request, build_opener
 
 from config.extensions import maker
-from config.output_schema import CommandSection, EmailSection, WebhookSection
-from estimators.compiled.orphan import killed_with_parent
+from config.output_schema import WebhookSection
 from estimators.errors import printable
 from sources.worker_process import gist
 
@@ -45,7 +39,7 @@ DELIVERY_PERIOD_S, MAX_RETRY_S = 0.2, 60.0
 """Between two looks at the queue of a receiver, and the longest wait after it has failed."""
 
 TIMEOUT_S = 10.0
-"""Longest time of a request to a web server, or of the exchange with a mail server."""
+"""Longest time of a request to a server."""
 
 
 class Receiver(Protocol):
@@ -163,85 +157,6 @@ class Webhook:
             raise
         finally:
             deadline.end()
-
-
-class PlainMail(smtplib.SMTP):
-    """Connection to a mail server, whose socket is added to a list as soon as it is connected."""
-
-    sockets: list[socket.socket]
-
-    def _get_socket(self, *args: Any) -> socket.socket:
-        sock: socket.socket = super()._get_socket(*args)  # type: ignore[misc]
-        self.sockets.append(sock.dup())
-        return sock
-
-
-class SecureMail(smtplib.SMTP_SSL, PlainMail):
-    """The same with TLS, whose handshake counts too."""
-
-
-class Mail:
-    """Sends alerts as e-mail."""
-
-    def __init__(self, section: EmailSection, secrets: Secrets = NO_SECRETS) -> None:
-        self._section = section
-        self._password = None if section.password_env is None else secrets[section.password_env]
-
-    def send(self, alert: AlertMessage) -> None:
-        """See `Receiver`."""
-        section, mail = self._section, EmailMessage()
-        mail["Subject"] = f"[{alert.twin}] {alert.status}: {alert.rule}"
-        mail["From"], mail["To"] = section.sender, ", ".join(section.to)
-        lines = [alert.text, "", f"Since {alert.since}; health is {alert.health}.", f"Response: {alert.response}"]
-        mail.set_content("\n".join([*lines, alert.link or alert.guide, "", alert.model_dump_json(indent=2)]))
-        context, deadline = ssl.create_default_context(), Deadline()
-        kind = SecureMail if section.security == "tls" else PlainMail
-        given: dict[str, Any] = {"context": context} if section.security == "tls" else {}
-        # A class of its own for each mail: the constructor connects, so the list cannot be given afterwards.
-        connected = type(kind.__name__, (kind,), {"sockets": deadline.sockets})
-        try:
-            with connected(section.server, section.port, timeout=TIMEOUT_S, **given) as server:
-                if section.security == "starttls":
-                    server.starttls(context=context)
-                if section.user is not None and self._password is not None:
-                    server.login(section.user, self._password)
-                server.send_message(mail)
-        except OSError as error:  # smtplib's own among them
-            text = f"it has not answered within {TIMEOUT_S:g} s" if deadline.missed(error) else str(error)
-            raise OSError(text) from None
-        finally:
-            deadline.end()
-
-
-class CommandReceiver:
-    """Starts a program for each alert."""
-
-    def __init__(self, section: CommandSection, folder: Path) -> None:
-        """`folder`: of the YAML."""
-        program, *arguments = section.command
-        self._command = [str(folder / program) if program.startswith("./") else program, *arguments]
-        self._timeout = section.timeout
-
-    def send(self, alert: AlertMessage) -> None:
-        """See `Receiver`."""
-        text = alert.model_dump_json()
-        try:
-            # A file, not a pipe: what the program leaves running would hold that open.
-            with tempfile.TemporaryFile() as said:
-                code = subprocess.run(
-                    self._command,
-                    input=text.encode(),
-                    stdout=subprocess.DEVNULL,
-                    stderr=said,
-                    timeout=self._timeout,
-                    preexec_fn=killed_with_parent,
-                ).returncode
-                said.seek(max(0, said.tell() - 1000) if code else 0)
-                last = (said.read(1000).decode(errors="replace").strip().splitlines() or [""])[-1]
-        except subprocess.TimeoutExpired:
-            raise OSError(f"it did not end within {self._timeout:g} s") from None
-        if code:
-            raise OSError(f"it ended with {code}{': ' if last else ''}{last}")
 
 
 class Delivery:
@@ -379,10 +294,6 @@ def make_receivers(
     for name, section in sections.items():
         if isinstance(section, WebhookSection):
             found[name] = Webhook(section, secrets)
-        elif isinstance(section, EmailSection):
-            found[name] = Mail(section, secrets)
-        elif isinstance(section, CommandSection):
-            found[name] = CommandReceiver(section, folder)
         elif section.type in outputs:
             found[name] = outputs[section.type]
         else:

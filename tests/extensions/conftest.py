@@ -1,7 +1,8 @@
 """Fixtures of `app` that the tests of extensions use."""
 
 from tests.app.conftest import browser, interruptible, nisus, shared_chromium, winding
+from tests.app.outputs.conftest import dripping, hook
 from tests.app.web.conftest import serve
 from tests.app.web.page.conftest import visit
 
-__all__ = ["browser", "interruptible", "nisus", "serve", "shared_chromium", "visit", "winding"]
+__all__ = ["browser", "dripping", "hook", "interruptible", "nisus", "serve", "shared_chromium", "visit", "winding"]

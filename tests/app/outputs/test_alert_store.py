@@ -10,16 +10,15 @@ import pytest
 
 from app.live.notices import Notices
 from app.live.store import FORMAT
-from app.outputs import Publisher, alert_store
+from app.outputs import alert_store
 from app.outputs.alert_store import AlertStore
 from app.outputs.alerts import SETTLE_S
 from app.outputs.receivers import Deliveries
 from app.twin.secrets import NO_SECRETS
 from config.output_schema import WebhookSection
 from estimators.errors import SourceError
-from sources.source import ignore
 from tests.app.outputs.pushed import push
-from tests.app.outputs.test_alerts import Looked, episode, kept_in, started, state
+from tests.app.outputs.test_alerts import Looked, episode, publishing, started, state
 from tests.support import run_python
 from tests.waiting import LIMIT_S, wait_for
 
@@ -234,12 +233,11 @@ import os, signal, sys
 from pathlib import Path
 from app.web.running import OpenedTwin, RunningTwin
 from sources.source import ignore
-from tests.app.outputs.test_alerts import kept_in, started
+from tests.app.outputs.test_alerts import started
 from tests.waiting import wait_for
 
-folder, first, value, count = Path(sys.argv[1]), int(sys.argv[2]), float(sys.argv[3]), int(sys.argv[4])
-receiver, told = kept_in(folder / "alerts")
-twin = started({"log": receiver})
+folder, first, value = Path(sys.argv[1]), int(sys.argv[2]), float(sys.argv[3])
+twin = started({"log": {"type": "webhook", "url": sys.argv[4]}})
 running = RunningTwin(OpenedTwin(twin, lambda report: twin.open_source(ignore), store=folder / "a.store"), door=None)
 running.start()
 source = running.engine.innermost
@@ -250,38 +248,32 @@ def stored():
     counts = publisher._parts.deliveries.counts()  # taken, which is stored after the next look
     return source.accepted and running.store.has(source.accepted) and counts == publisher._store._written == [(1, 0)]
 wait_for(stored)
-assert len(told()) == count
 os.kill(os.getpid(), signal.SIGKILL)
 """
 
 
-def test_a_yaml_that_is_saved_while_an_alert_is_open_does_not_begin_it_again(serve, tmp_path, monkeypatch):
+def test_a_yaml_that_is_saved_while_an_alert_is_open_does_not_begin_it_again(serve, hook, monkeypatch):
     monkeypatch.setattr("app.outputs.alerts.SETTLE_S", 0.0)
-    receiver, told = kept_in(tmp_path / "alerts")
     rule = "{state: temperature, above: 45, after: 0, clear: 0}"
-    twin = started({"log": receiver}, f"[{rule}]")
-    page = serve(twin=twin, behind=lambda _: twin.open_source(ignore))
-    publisher = page.engine.published = Publisher(page.engine)
-
-    publisher.start()
-    try:
+    with publishing(serve, {"log": hook.section}, f"[{rule}]") as page:
+        publisher = page.engine.published
         for k in range(30):
             push(page, (k, 50.0))
-        wait_for(lambda: len(told()) == 1)
-        first, page.engine.twin = publisher._parts, started({"log": receiver}, f"[{{health: stale}}, {rule}]")
+        wait_for(lambda: len(hook.alerts) == 1)
+        first = publisher._parts
+        page.engine.twin = started({"log": hook.section}, f"[{{health: stale}}, {rule}]")
         wait_for(lambda: publisher._parts is not first)
         for k in range(30, 80):
             push(page, (k, 40.0))
-        wait_for(lambda: len(told()) == 2)
-    finally:
-        publisher.stop()
-    assert [alert["status"] for alert in told()] == ["firing", "resolved"]
-    assert told()[0]["id"] == told()[1]["id"]
+        wait_for(lambda: len(hook.alerts) == 2)
+    assert [alert["status"] for alert in hook.alerts] == ["firing", "resolved"]
+    assert hook.alerts[0]["id"] == hook.alerts[1]["id"]
 
 
-def test_a_killed_process_is_followed_by_one_that_resolves_its_alert(tmp_path):
-    for arguments in (("0", "50.0", "1"), ("60", "40.0", "2")):
-        run_python(RUN, tmp_path, *arguments, status=-signal.SIGKILL, timeout=LIMIT_S)
-    told = kept_in(tmp_path / "alerts")[1]()
+def test_a_killed_process_is_followed_by_one_that_resolves_its_alert(tmp_path, hook):
+    for first, value, count in (("0", "50.0", 1), ("60", "40.0", 2)):
+        run_python(RUN, tmp_path, first, value, hook.url, status=-signal.SIGKILL, timeout=LIMIT_S)
+        assert len(hook.alerts) == count
+    told = hook.alerts
     assert [alert["status"] for alert in told] == ["firing", "resolved"]
     assert told[0]["id"] == told[1]["id"] and told[0]["since"] == told[1]["since"]

@@ -2,12 +2,9 @@
 
 import hashlib
 import hmac
-import json
-import os
-import socketserver
 import sys
 import threading
-from contextlib import suppress
+from contextlib import contextmanager
 from http.server import BaseHTTPRequestHandler, HTTPServer
 from types import SimpleNamespace
 
@@ -16,19 +13,18 @@ from scipy.stats import norm
 
 from app.live.outputs import AlertMute
 from app.outputs import Publisher
-from app.outputs import receivers as sending
 from app.outputs.alerts import AlertRules, heartbeat
-from app.outputs.receivers import MAX_WAITING_ALERTS, CommandReceiver, Delivery, Mail, Webhook
+from app.outputs.receivers import MAX_WAITING_ALERTS, Delivery, Webhook
 from app.present.state_message import PublishedState, StateMessage
 from app.twin.twin import load_twin
-from config.output_schema import AlertSection, CommandSection, EmailSection, WebhookSection
+from config.output_schema import AlertSection, WebhookSection
 from estimators.diagnostics.episodes import Episode
 from estimators.errors import ConfigError
 from sources.source import ignore
 from tests.app.outputs.pushed import push, pushed_twin
 from tests.app.scripted import notice_texts
 from tests.support import error_of
-from tests.waiting import LIMIT_S, wait_for
+from tests.waiting import wait_for
 
 
 def state(value=100.0, std=10.0, grade="", **fields):
@@ -135,88 +131,34 @@ def test_nothing_is_sent_while_muted_or_after_a_maintenance():
     assert rules.at(108.0, model_version=2, **bad) == ["firing"]
 
 
-class Hook:
-    """An HTTP server that keeps what it gets and answers with `code`."""
-
-    def __init__(self):
-        self.received, self.code = [], 200
-        hook = self
-
-        class Handler(BaseHTTPRequestHandler):
-            def do_POST(self):  # noqa: N802
-                body = self.rfile.read(int(self.headers["Content-Length"]))
-                if hook.code == 200:
-                    hook.received.append((dict(self.headers), body))
-                self.send_response(hook.code)
-                self.send_header("Location", "http://127.0.0.1:9/")
-                self.end_headers()
-
-            def log_message(self, *args):
-                pass
-
-        self.server = HTTPServer(("127.0.0.1", 0), Handler)
-        self.url = f"http://127.0.0.1:{self.server.server_port}/hook"
-        threading.Thread(target=self.server.serve_forever, daemon=True).start()
-
-    @property
-    def alerts(self):
-        return [json.loads(body) for _, body in self.received]
-
-
-@pytest.fixture
-def hook():
-    made = Hook()
-    yield made
-    made.server.shutdown()
-    made.server.server_close()
-
-
-class MailServer(socketserver.StreamRequestHandler):
-    """As much of SMTP as one message needs."""
-
-    def handle(self):
-        self.wfile.write(b"220 test\r\n")
-        for line in self.rfile:
-            word = line[:4].upper().strip()
-            if word == b"DATA":
-                self.wfile.write(b"354 go on\r\n")
-                text = b"".join(iter(self.rfile.readline, b".\r\n"))
-                self.server.mails.append(text.decode())
-            self.wfile.write(b"221 bye\r\n" if word == b"QUIT" else b"250 ok\r\n")
-
-
-def kept_in(file):
-    """A receiver that appends each alert to a file, and a function that reads all of them."""
-    program = "import sys; open(sys.argv[1], 'a').write(sys.stdin.read() + chr(10))"
-    receiver = {"type": "command", "command": [sys.executable, "-c", program, str(file)]}
-    return receiver, lambda: [json.loads(line) for line in file.read_text().splitlines()] if file.exists() else []
-
-
 def started(receivers, alerts="[{state: temperature, above: 45, after: 0, clear: 0}]"):
     """A twin whose measurements come by `push`, with its publisher."""
     return pushed_twin({"receivers": receivers}, alerts=alerts)
 
 
-def test_every_receiver_gets_the_alert_although_one_is_dead(serve, hook, tmp_path, monkeypatch):
-    mail = socketserver.ThreadingTCPServer(("127.0.0.1", 0), MailServer)
-    mail.mails = []
-    threading.Thread(target=mail.serve_forever, daemon=True).start()
-    monkeypatch.setenv("NISUS_TEST_SECRET", "a key")
-    log, told = kept_in(tmp_path / "alerts")
-    twin = started({
-        "dead": {"type": "webhook", "url": "http://127.0.0.1:9/"},
-        "ops": {"type": "webhook", "url": hook.url, "secret_env": "NISUS_TEST_SECRET", "heartbeat": 3600},
-        "mail": {"type": "email", "to": "ops@plant", "sender": "nisus@plant", "server": "127.0.0.1",
-                 "port": mail.server_address[1]},
-        "log": log,
-    })  # fmt: skip
+@contextmanager
+def publishing(serve, receivers, *alerts, **options):
+    """The page of a twin of `started` while its publisher runs."""
+    twin = started(receivers, *alerts)
     page = serve(twin=twin, behind=lambda _: twin.open_source(ignore))
-    publisher = page.engine.published = Publisher(page.engine, page="http://127.0.0.1:9900")
+    publisher = page.engine.published = Publisher(page.engine, **options)
     publisher.start()
     try:
+        yield page
+    finally:
+        publisher.stop()
+
+
+DEAD = {"type": "webhook", "url": "http://127.0.0.1:9/"}
+
+
+def test_every_receiver_gets_the_alert_although_one_is_dead(serve, hook, monkeypatch):
+    monkeypatch.setenv("NISUS_TEST_SECRET", "a key")
+    ops = hook.section | {"secret_env": "NISUS_TEST_SECRET", "heartbeat": 3600}
+    with publishing(serve, {"dead": DEAD, "ops": ops}, page="http://127.0.0.1:9900") as page:
         for k in range(30):
             push(page, (k, 50.0))
-        wait_for(lambda: len(hook.received) == 2 and mail.mails and told())
+        wait_for(lambda: len(hook.received) == 2)
         first, alert = sorted(hook.alerts, key=lambda item: item["status"] == "firing")
         assert first["status"] == "heartbeat"
         probability = norm.sf(45.0, alert["value"], alert["std"])
@@ -225,26 +167,16 @@ def test_every_receiver_gets_the_alert_although_one_is_dead(serve, hook, tmp_pat
         headers, body = hook.received[-1]
         signed = headers["X-Nisus-Timestamp"].encode() + b"." + body
         assert headers["X-Nisus-Signature"] == "sha256=" + hmac.new(b"a key", signed, hashlib.sha256).hexdigest()
-        assert "Subject: [motor_winding] firing: temperature-above" in mail.mails[0]
-        assert [item["id"] for item in told()] == [alert["id"]]
         wait_for(lambda: page.get("/api/alerts")["receivers"][0]["failing"])
-        # The program of the command may not have ended yet.
-        wait_for(lambda: [item["waiting"] for item in page.get("/api/alerts")["receivers"]] == [1, 0, 0, 0])
+        wait_for(lambda: [item["waiting"] for item in page.get("/api/alerts")["receivers"]] == [1, 0])
         found = page.get("/api/alerts")
         assert [(item["rule"], item["subject"]) for item in found["alerts"]] == [("temperature-above", "temperature")]
-        text = page.client.get("/metrics").text
-        assert 'nisus_output_up{output="alerts to dead",twin="motor_winding"} 0.0' in text
-        assert 'nisus_alerts_total{outcome="delivered",receiver="ops",twin="motor_winding"} 2.0' in text
         lines = notice_texts(page.engine)
         assert sum("receiver dead fails" in line for line in lines) == 1
         for k in range(30, 80):
             push(page, (k, 40.0))
         wait_for(lambda: hook.alerts[-1]["status"] == "resolved")
         assert hook.alerts[-1]["id"] == alert["id"]
-    finally:
-        publisher.stop()
-        mail.shutdown()
-        mail.server_close()
 
 
 def test_a_receiver_that_failed_gets_what_waited_in_order_and_a_full_queue_drops_the_oldest():
@@ -284,6 +216,18 @@ def test_an_answer_that_is_no_success_counts_as_a_failure_and_is_not_followed(ho
         Webhook(WebhookSection(type="webhook", url=hook.url)).send(heartbeat("motor", "tracking"))
 
 
+def assert_fails(receiver, reason):
+    """An alert waits, is tried again, and the failure is told in one line."""
+    said = []
+    notices = SimpleNamespace(say=lambda text, level="info": said.append(text), count=lambda key: None)
+    delivery = Delivery("ops", receiver, notices)
+    delivery.put(heartbeat("motor", "tracking"))
+    assert delivery.step() == 1.0 and delivery.step() == 2.0
+    assert delivery.failing and delivery.waiting == 1
+    (line,) = said
+    assert reason in line and "\n" not in line
+
+
 class Nonsense(BaseHTTPRequestHandler):
     """Answers with bytes of no protocol."""
 
@@ -292,7 +236,7 @@ class Nonsense(BaseHTTPRequestHandler):
         self.wfile.write(b"nonsense\r\n\r\n")
 
 
-def test_a_receiver_that_answers_nonsense_fails_as_any_other(tmp_path):
+def test_a_receiver_that_answers_nonsense_fails_as_any_other():
     class Silent:
         def send(self, alert):
             raise ConnectionError
@@ -300,32 +244,9 @@ def test_a_receiver_that_answers_nonsense_fails_as_any_other(tmp_path):
     with HTTPServer(("127.0.0.1", 0), Nonsense) as server:
         threading.Thread(target=server.serve_forever, daemon=True).start()
         hook = Webhook(WebhookSection(type="webhook", url=f"http://127.0.0.1:{server.server_address[1]}/"))
-        program = "import os, sys; os.write(2, bytes([255])); sys.exit(int(sys.argv[1]))"
-        command = [
-            CommandReceiver(CommandSection(type="command", command=[sys.executable, "-c", program, code]), tmp_path)
-            for code in "30"
-        ]
-        said = []
-        notices = SimpleNamespace(say=lambda text, level="info": said.append(text), count=lambda key: None)
-        for receiver, reason in ((hook, "nonsense"), (command[0], "it ended with 3"), (Silent(), "ConnectionError")):
-            delivery = Delivery("ops", receiver, notices)
-            delivery.put(heartbeat("motor", "tracking"))
-            assert delivery.step() == 1.0 and delivery.step() == 2.0
-            assert delivery.failing and delivery.waiting == 1 and reason in said[-1]
+        for receiver, reason in ((hook, "nonsense"), (Silent(), "ConnectionError")):
+            assert_fails(receiver, reason)
         server.shutdown()
-    assert len(said) == 3 and all("\n" not in text for text in said)
-    # One that leaves a program running has ended too.
-    os.mkfifo(tmp_path / "end")
-    child = "import subprocess, sys; subprocess.Popen([sys.executable, '-c', {!r}, sys.argv[1]])"
-    child = child.format("import sys; open(sys.argv[1])")
-    words = [sys.executable, "-c", child, str(tmp_path / "end")]
-    leaves = CommandReceiver(CommandSection(type="command", command=words, timeout=LIMIT_S), tmp_path)
-    for receiver in (command[1], leaves):
-        delivery = Delivery("ops", receiver, notices)
-        delivery.put(heartbeat("motor", "tracking"))
-        delivery.step()
-        assert (delivery.delivered, delivery.waiting) == (1, 0)
-    open(tmp_path / "end", "w").close()
 
 
 @pytest.mark.parametrize(
@@ -334,38 +255,12 @@ def test_a_receiver_that_answers_nonsense_fails_as_any_other(tmp_path):
         ("http", b"HTTP/1.1 200 OK\r\nX: ", 0.0),
         ("https", b"\x16\x03\x03\x40\x00", 0.0),
         ("https", b"\x16\x03\x03\x40\x00", 3.0),
-        ("smtp", b"220 ", 0.0),
-        ("smtps", b"\x16\x03\x03\x40\x00", 0.0),
-        ("smtps", b"\x16\x03\x03\x40\x00", 3.0),
     ],
 )
-def test_a_receiver_that_answers_byte_by_byte_fails_after_the_timeout(monkeypatch, scheme, first, late):
-    """Of a handshake the socket's own timeout may pass first, as where the timer's thread is late."""
-    monkeypatch.setattr(sending, "TIMEOUT_S", 0.3)
-    timer = threading.Timer
-    monkeypatch.setattr(sending.threading, "Timer", lambda seconds, end: timer(seconds + late, end))
-
-    class Drip(socketserver.BaseRequestHandler):
-        def handle(self):
-            with suppress(OSError):
-                self.request.sendall(first)
-                for _ in range(1000):  # each byte comes in good time
-                    self.request.sendall(b"x")
-                    threading.Event().wait(0.01)
-                self.request.sendall(b"\r\n\r\n")
-
-    with socketserver.ThreadingTCPServer(("127.0.0.1", 0), Drip) as server:
-        threading.Thread(target=server.serve_forever, daemon=True).start()
-        port = server.server_address[1]
-        if scheme.startswith("smtp"):
-            security = "tls" if scheme == "smtps" else "none"
-            place = {"server": "127.0.0.1", "port": port, "security": security}
-            receiver = Mail(EmailSection(type="email", to="ops@plant", sender="nisus@plant", **place))
-        else:
-            receiver = Webhook(WebhookSection(type="webhook", url=f"{scheme}://127.0.0.1:{port}/"))
-        with pytest.raises(OSError, match="it has not answered within 0.3 s"):
-            receiver.send(heartbeat("motor", "tracking"))
-        server.shutdown()
+def test_a_receiver_that_answers_byte_by_byte_fails_after_the_timeout(dripping, scheme, first, late):
+    section = WebhookSection(type="webhook", url=f"{scheme}://127.0.0.1:{dripping(first, late)}/")
+    with pytest.raises(OSError, match="it has not answered within 0.3 s"):
+        Webhook(section).send(heartbeat("motor", "tracking"))
 
 
 def test_a_mute_is_asked_for_by_a_command(serve):
@@ -407,8 +302,6 @@ def test_a_rule_that_means_nothing_is_refused_in_one_line(outputs, alerts, text)
             "receivers:\n    ops:\n      {type: webhook, url: http://a,\n      secret_env: NISUS_NO_SECRET}",
             "receivers.ops.secret_env",
         ),
-        ("mqtt:\n    host: a\n    user: a\n    password_env: NISUS_NO_SECRET", "mqtt.password_env"),
-        ("opcua:\n    port: 4840\n    user: a\n    password_env: NISUS_NO_SECRET", "opcua.password_env"),
     ],
 )
 def test_a_secret_that_is_not_set_is_one_line_with_its_place(serve, outputs, key, tmp_path, monkeypatch):

@@ -10,7 +10,6 @@ from app.extensions.fleet.plan import load_fleet
 from app.extensions.fleet.publisher import FleetPublisher
 from app.outputs.alerts import SETTLE_S
 from tests.app.outputs.test_alert_store import restarted
-from tests.app.outputs.test_alerts import kept_in
 from tests.extensions.fleet import test_alerts as of_fleets
 from tests.waiting import wait_for
 
@@ -72,10 +71,9 @@ def test_a_fleet_repeats_and_resolves_after_a_restart():
     assert not other.rules.state()
 
 
-def test_a_fleet_resolves_after_a_restart_with_its_assets_in_another_order(tmp_path, monkeypatch):
+def test_a_fleet_resolves_after_a_restart_with_its_assets_in_another_order(tmp_path, hook, monkeypatch):
     monkeypatch.setattr("app.extensions.fleet.alerts.SETTLE_S", 0.0)
-    receiver, told = kept_in(tmp_path / "alerts")
-    outputs = {"every": 0.02, "receivers": {"log": receiver}}
+    outputs = {"every": 0.02, "receivers": {"log": hook.section}}
     given = {"twin": "motor_winding", "source": {"type": "push"}, "outputs": outputs}
     given["alerts"] = [{"health": "degraded", "after": 0, "clear": 0, "group": 0}]
     (tmp_path / "pumps.yaml").write_text(json.dumps(given))
@@ -87,14 +85,14 @@ def test_a_fleet_resolves_after_a_restart_with_its_assets_in_another_order(tmp_p
         publisher = FleetPublisher(fleet, store=tmp_path / "pumps.store")
         publisher.start()
         try:
-            wait_for(lambda: len(told()) == count)
+            wait_for(lambda: len(hook.alerts) == count)
         finally:
             publisher.stop()
 
     run(["a", "b", "c"], ["degraded", "tracking", "stale"], 1)
     run(["c", "a", "b", "d"], ["tracking", "tracking", "tracking", "degraded"], 2)
     run(["d", "b", "c", "a"], ["tracking"] * 4, 3)
-    alerts = told()
+    alerts = hook.alerts
     assert [alert["status"] for alert in alerts] == ["firing", "firing", "resolved"]
     assert len({alert["id"] for alert in alerts}) == 1
     assert (alerts[1]["fired"], alerts[1]["recovered"]) == (["d"], ["c", "a"])

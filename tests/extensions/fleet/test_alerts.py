@@ -18,7 +18,7 @@ from estimators.errors import ConfigError
 from estimators.fleet.fleet import Fleet
 from estimators.models import MODELS
 from estimators.track import HEALTH_NAMES
-from tests.app.outputs.test_alerts import kept_in, state
+from tests.app.outputs.test_alerts import state
 from tests.cases import cases
 from tests.support import error_of
 from tests.waiting import wait_for
@@ -131,10 +131,9 @@ def started(folder, outputs, alerts=()):
     return RunningFleet(load_fleet(path), lambda *_: None, threads=1)
 
 
-def test_silent_assets_are_one_alert_of_a_receiver_which_is_resolved(tmp_path, capsys):
-    log, received = kept_in(tmp_path / "alerts")
+def test_silent_assets_are_one_alert_of_a_receiver_which_is_resolved(tmp_path, hook, capsys):
     rule = {"health": "degraded", "after": 0, "clear": 0, "group": 0}
-    fleet = started(tmp_path, {"every": 0.05, "receivers": {"log": log}}, [rule])
+    fleet = started(tmp_path, {"every": 0.05, "receivers": {"log": hook.section}}, [rule])
     publisher, source = FleetPublisher(fleet, page="http://127.0.0.1:1"), messages_of(fleet)
 
     def send(first, last, assets):
@@ -150,16 +149,16 @@ def test_silent_assets_are_one_alert_of_a_receiver_which_is_resolved(tmp_path, c
     try:
         send(30, 41, [0, 1])  # the others have been silent for 12 s
         fleet.step()
-        wait_for(lambda: len(received()) == 1)
-        (alert,) = received()
+        wait_for(lambda: len(hook.alerts) == 1)
+        (alert,) = hook.alerts
         assert {key: alert[key] for key in ("twin", "status", "rule", "value", "unit")} == {
             "twin": "pumps", "status": "firing", "rule": "health-degraded", "value": 3.0, "unit": "assets",
         }  # fmt: skip
         assert alert["fired"] == ["pump 2", "pump 3", "pump 4"]
         assert {item["cause"] for item in alert["assets"]} == {"silent"}
         send(41, 42, range(5))
-        wait_for(lambda: len(received()) == 2)
-        assert received()[1]["status"] == "resolved" and len(received()[1]["recovered"]) == 3
+        wait_for(lambda: len(hook.alerts) == 2)
+        assert hook.alerts[1]["status"] == "resolved" and len(hook.alerts[1]["recovered"]) == 3
     finally:
         publisher.stop()
         fleet.stop()

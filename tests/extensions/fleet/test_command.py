@@ -153,7 +153,7 @@ def test_a_live_source_without_measurements_is_told_from_wrong_channels(tmp_path
 
 def test_open_alerts_of_a_fleet_are_kept_beside_its_store(tmp_path, monkeypatch, capsys):
     monkeypatch.chdir(tmp_path)
-    receivers = "outputs: {receivers: {ops: {type: command, command: [cat]}}}"
+    receivers = "outputs: {receivers: {ops: {type: webhook, url: 'http://127.0.0.1:9'}}}"
     (tmp_path / "pumps.yaml").write_text(f"twin: motor_winding\nsource: {{type: push}}\n{receivers}\n")
     assert main(["fleet", "pumps.yaml", "--headless", "--duration", "0.1", "--store", "."]) == 2
     assert (tmp_path / "pumps.store.alerts").exists()

@@ -7,7 +7,10 @@ from pathlib import Path
 
 from prometheus_client.parser import text_string_to_metric_families
 
+from tests.app.outputs.pushed import push
+from tests.app.outputs.test_alerts import DEAD, publishing
 from tests.app.web.test_state_api import page, state
+from tests.waiting import wait_for
 
 __all__ = ["page"]
 
@@ -49,6 +52,18 @@ def test_problems_are_counted_by_kind_and_the_dashboard_asks_for_what_there_is(p
         for name, labels in re.findall(r"\b((?:nisus|process)_\w+)(?:\{([^}]*)\})?", expression):
             assert name in known, expression
             assert set(re.findall(r"(\w+)[!=]", labels)) <= known[name], expression
+
+
+def test_alerts_are_counted_by_receiver(serve, hook):
+    with publishing(serve, {"dead": DEAD, "ops": hook.section}) as page:
+        for k in range(30):
+            push(page, (k, 50.0))
+
+        def told(line):
+            return line in page.client.get("/metrics").text
+
+        wait_for(lambda: told('nisus_output_up{output="alerts to dead",twin="motor_winding"} 0.0'))
+        wait_for(lambda: told('nisus_alerts_total{outcome="delivered",receiver="ops",twin="motor_winding"} 1.0'))
 
 
 def test_metrics_name_the_package_that_they_need(page, monkeypatch):

@@ -261,18 +261,17 @@ def test_a_folder_is_watched_and_a_twin_that_cannot_start_is_one_line(tmp_path):
         running.stop()
 
 
-def test_alerts_link_to_the_page_of_the_twin_at_the_service(tmp_path):
+def test_alerts_link_to_the_page_of_the_twin_at_the_service(tmp_path, hook):
     public = "https://twins.example.com"
-    program = "import sys; open('alerts', 'a').write(sys.stdin.read() + chr(10))"
-    log = json.dumps({"receivers": {"log": {"type": "command", "command": [sys.executable, "-c", program]}}})
+    log = json.dumps({"receivers": {"log": hook.section}})
     text = (ROOT / "config" / "twins" / "motor_winding.yaml").read_text()
     always = "alerts: [{state: temperature, above: -1000, after: 0}]"
     (tmp_path / "pump 1.yaml").write_text(f"{text}\noutputs: {log}\n{always}\n")
     write_tokens(tmp_path)
     running = Served(tmp_path, "pump 1.yaml", "--tokens", "tokens", "--public", public)
     try:
-        running.wait(lambda _: (tmp_path / "alerts").exists())
-        alert = json.loads((tmp_path / "alerts").read_text().splitlines()[0])
+        running.wait(lambda _: hook.alerts)
+        alert = hook.alerts[0]
         assert alert["link"] == f"{public}/twins/pump%201/alarms#limit-of-a-state"
         # A link has no token.
         assert running.ask(alert["link"].removeprefix(public))[0] == 200
