@@ -59,6 +59,8 @@ class Extension:
     output of the same name is the receiver itself."""
     models: Parts = field(default_factory=dict)
     """Models in files, by the key of the file in `model`. `make(loaded, section, path)` returns a StateSpaceModel."""
+    corrections: Parts = field(default_factory=dict)
+    """Of `learned`: `file`. `make(loaded, model, path)` returns a LearnedCorrection, and its place for errors."""
     executors: Parts = field(default_factory=dict)
     """Work on other machines, at the address that `--cluster` gives. `calls`: `make(address, begin, given)`; `folds`:
     `make(address, twin, held, name, overrides)`. Each is a context manager; see `app.studies.processes`."""
@@ -82,8 +84,8 @@ class Extension:
 
 
 Kind = Literal[
-    "commands", "sources", "outputs", "receivers", "models", "executors", "tables", "folders", "tracks", "archives",
-    "pictures", "routes", "panels",
+    "commands", "sources", "outputs", "receivers", "models", "corrections", "executors", "tables", "folders", "tracks",
+    "archives", "pictures", "routes", "panels",
 ]  # fmt: skip
 TAGGED = ("sources", "receivers")
 """Kinds of which a section is recognised by its `type`, a literal that is the name of the part."""

@@ -33,7 +33,6 @@ from estimators.plausibility import DAY, surprise
 from .checks import check_named, check_names, estimated_names, one_each
 from .defaults import instrument_sections, parameter_sections
 from .landmarks import expanded
-from .learned import load_learned
 from .matrices import matrices_model
 from .sources.kind import signal_ends
 
@@ -68,15 +67,16 @@ def find_model(loaded: Loaded, key: Key, reference: Model) -> StateSpaceModel:
 
 
 def model_files(loaded: Loaded) -> tuple[Path, ...]:
-    """Return the user's file of the model and those beside it that it imports; none for a bundled model."""
-    model = loaded.config.model
+    """Return the user's file of the model, those beside it that it imports, and that of its correction."""
+    model, learned = loaded.config.model, loaded.config.learned
+    correction = () if learned is None else (_beside(loaded, learned),)
     if not isinstance(model, str):
-        return (_beside(loaded, model_file(model)),)
+        return (_beside(loaded, model_file(model)), *correction)
     file = model.rpartition(":")[0]
     if not file:
-        return ()
+        return correction
     path = _beside(loaded, file)
-    return (path, *imported_beside(path))
+    return (path, *imported_beside(path), *correction)
 
 
 def _existing(loaded: Loaded, key: Key, reference: str, file: str | None = None) -> Path:
@@ -166,7 +166,10 @@ def configure(model: StateSpaceModel, loaded: Loaded) -> StateSpaceModel:
 def _assembled(model: StateSpaceModel, loaded: Loaded) -> StateSpaceModel:
     """Return the model with the correction, coloured noise, sensor errors and joint parameters of the YAML."""
     config = loaded.config
-    learned, learned_place = load_learned(model, loaded)
+    learned, learned_place = None, ""
+    if config.learned is not None:
+        make = maker("corrections", "file", f"{loaded.places.at(('learned',))}: learned", "learned")
+        learned, learned_place = make(loaded, model, _beside(loaded, config.learned))
     noises = {name: section.over for name, section in config.noise.items() if section.over is not None}
     given = {name: section.error for name, section in config.sensors.items() if section.error is not None}
     known = [*(item.name for item in model.noises), *map(learned_noise, learned.corrects if learned else ())]

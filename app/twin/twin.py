@@ -32,7 +32,6 @@ from ..ingest import Planned, UnknownInputs
 from .checks import check_named, check_names, check_outputs, check_refit, check_scene, commissioned
 from .defaults import DegradedAfter, Late, degraded_after, driven_states, late_policy, parameter_sections
 from .landmarks import expanded
-from .learned import correction_files
 from .model import configure, find_model, model_files
 from .source import Plan, plan_source
 
@@ -84,7 +83,7 @@ class Twin:
     def files(self) -> tuple[Path, ...]:
         """Files of the twin: its YAML, its tuning version, the user's files of its model and correction."""
         version = () if self.version is None else (self.version.path,)
-        return (self.path, *version, *model_files(self.loaded), *correction_files(self.loaded))
+        return (self.path, *version, *model_files(self.loaded))
 
     @property
     def name(self) -> str:

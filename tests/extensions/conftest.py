@@ -2,7 +2,10 @@
 
 from tests.app.conftest import browser, interruptible, nisus, shared_chromium, winding
 from tests.app.outputs.conftest import dripping, hook
+from tests.app.twin.conftest import inside
 from tests.app.web.conftest import serve
 from tests.app.web.page.conftest import visit
 
-__all__ = ["browser", "dripping", "hook", "interruptible", "nisus", "serve", "shared_chromium", "visit", "winding"]
+__all__ = [
+    "browser", "dripping", "hook", "inside", "interruptible", "nisus", "serve", "shared_chromium", "visit", "winding",
+]  # fmt: skip

@@ -1,10 +1,11 @@
-"""Learned corrections of a model: training data from recordings, training, and judging, as `nisus learn` does it.
+"""Learned corrections of a model, `learned` in a twin's YAML: read from a file, and what `nisus learn` does.
 
-A twin with a correction does without this: app/twin/learned.py, estimators/model/correction.py.
+The mathematics are in estimators/model/correction.py.
 """
 
 from config.extensions import Extension, Part
 
 EXTENSION = Extension(
-    commands={"learn": Part(f"{__name__}.arguments:LearnCommand", f"{__name__}.learn:learn_correction")}
+    commands={"learn": Part(f"{__name__}.arguments:LearnCommand", f"{__name__}.learn:learn_correction")},
+    corrections={"file": Part("", f"{__name__}.correction:correction_of")},
 )

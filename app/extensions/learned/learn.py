@@ -12,7 +12,6 @@ from app.cli.options import check_output, names_of, overrides_of
 from app.cli.prepare import attend, prepare
 from app.present.result import to_json, to_text
 from app.terminal import complain
-from app.twin.learned import run_net
 from app.twin.log_reader import read_log
 from app.twin.model import physics_of
 from app.twin.twin import Twin, load_twin
@@ -27,6 +26,7 @@ from estimators.registry import find_estimator
 from estimators.smoothing.smooth import check_smooth
 from estimators.tuning import Tuning
 
+from .correction import run_net
 from .lesson import Lesson, as_dict, correction_text, noises_of, scores_of, sections
 from .train import NET, Trained, against, on_windows, train
 from .windows import Windows, known_states, windows

@@ -12,13 +12,13 @@ from app.live.tunings.versions import now
 from app.present.result import Topic
 from app.present.runs_json import part_json
 from app.twin.twin import Twin
-from config.companion_schema import LearnedHeadSection
 from config.yaml_files import as_flow, as_section, rounded
 from estimators.diagnostics.sensitivity.responses import digits
 from estimators.fit.judge import PartScore
 from estimators.model.correction import Correction, GaussianProcess, Net, Ridge
 from estimators.model.state_space import StateSpaceModel
 
+from .schema import LearnedHeadSection
 from .train import OnWindows, Trained
 
 TUNINGS = ("physics", "physics, its noise from the windows", "with the correction")

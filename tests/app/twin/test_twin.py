@@ -7,6 +7,7 @@ import pytest
 
 from app.live.tunings.tuning_yaml import tuning_yaml
 from app.twin.twin import load_twin, restore_twin
+from config import extensions
 from estimators.compiled.model import compile_model
 from estimators.errors import ConfigError, ModelError
 from tests.app.twin.written import refusal, twin_of
@@ -127,6 +128,12 @@ def test_a_model_from_a_file_beside_the_yaml(monkeypatch):
     Path("twins/pump.py").write_text(PUMP.replace("0.9", "0.8"))
     compile_model(load_twin("twins/pump.yaml").model).f(np.array([2.0]), np.zeros(0), np.zeros(0), 1.0, out)
     assert out[0] == pytest.approx(1.6), "an edited file is read again"
+
+
+def test_a_correction_without_its_extension_is_one_line(monkeypatch):
+    monkeypatch.setattr(extensions, "registered", lambda kind: {})
+    text = refusal("model: motor_winding\nlearned: no.yaml\nsource: {type: simulator}\n")
+    assert text.startswith("motor.yaml:2: learned: needs an extension; install it with `pip install 'nisus[learned]'`")
 
 
 @pytest.mark.parametrize(

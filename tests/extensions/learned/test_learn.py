@@ -4,13 +4,17 @@ import numpy as np
 import pytest
 import yaml
 
+from app.extensions.learned.correction import learned_of
+from app.extensions.learned.schema import load_correction
 from app.twin.log_reader import read_log
 from app.twin.twin import load_twin
 from estimators.diagnostics.score import score
-from estimators.log import TRUTH
-from tests.app.twin.test_learned import net_file
+from estimators.log import TRUTH, truth_of
+from tests.app.twin import test_shipped as shipped
 from tests.cases import cases
 from tests.support import folded
+
+from .test_correction import net_file
 
 MODEL = """\
 from estimators.model import Input, Noise, Row, Sensor, State, StateSpaceModel
@@ -87,7 +91,7 @@ def test_what_the_model_leaves_out_is_learned_kept_and_folded(heated, kind, nisu
     noise = {"learned": keep.name, "noise.body.variance": "0.03"}
     twin = load_twin(heated, overrides=noise)
     assert [item.name for item in twin.model.noises] == ["body", "shell", "body_learned"]
-    correction = load_correction(keep)
+    correction = learned_of(load_correction(keep)[0], keep).correction
     z = np.linspace(0.1, 1.9, 19)[:, None]
     # Noise of 0.05 °C a step is a rate of 0.016 °C/s of a window; most windows see two loads.
     np.testing.assert_allclose(correction.mean(z)[:, 0], heating(z[:, 0]), rtol=0.0, atol=0.1)
@@ -99,13 +103,6 @@ def test_what_the_model_leaves_out_is_learned_kept_and_folded(heated, kind, nisu
     # The noise is what the command printed. Most of the error is gone.
     assert errors["hybrid"].rmse < 0.4 * errors["physics"].rmse
     assert errors["hybrid"].coverage > 0.85 > errors["physics"].coverage
-
-
-def load_correction(path):
-    from app.twin.learned import learned_of
-    from config.companion_schema import load_correction as load
-
-    return learned_of(load(path)[0], path).correction
 
 
 def test_where_the_model_has_all_of_it_nothing_is_kept(tmp_path, nisus):
@@ -145,3 +142,15 @@ def test_a_net_is_judged_kept_and_folded(heated, nisus):
 @cases(__file__, "refused_learn.csv")
 def test_wrong_arguments_are_one_line(heated, nisus, arguments, said):
     assert said in nisus.refuses("learn", heated, *LEARN, "--kind", "ridge", *arguments.split())
+
+
+def test_what_was_learned_of_the_magnet_holds_where_it_was_not_learned():
+    def last(name):
+        events, track = (fold := shipped.folded(name)).log.events, fold.track
+        rows, values = truth_of(events, 3)
+        rows, values = rows[(late := events.t[rows] >= events.t[0] + 1_200_000_000_000)], values[late]
+        return float(np.sqrt(np.mean((track.mean[rows, 3] - values) ** 2)))
+
+    # Physics of a data sheet, with what 20 minutes taught: as the opening text says, and nearer than fitted physics.
+    assert last("motor_bench_hybrid") == pytest.approx(0.627, abs=5e-3)
+    assert last("motor_bench") == pytest.approx(0.937, abs=5e-3)

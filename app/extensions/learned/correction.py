@@ -8,7 +8,6 @@ from pathlib import Path
 
 import numpy as np
 
-from config.companion_schema import CorrectionSection, load_correction
 from config.loader import Loaded
 from config.yaml_files import shown_path
 from estimators.errors import ConfigError
@@ -17,19 +16,17 @@ from estimators.model.hybrid import LearnedCorrection
 from estimators.model.state_space import StateSpaceModel
 from sources.worker_process import gist
 
+from .schema import CorrectionSection, load_correction
+
 INSTALL = "pip install 'nisus[learned]'"
 
 
-def load_learned(model: StateSpaceModel, loaded: Loaded) -> tuple[LearnedCorrection | None, str]:
-    """Return the correction that the YAML names, if it names one, and its file as errors name it.
+def correction_of(loaded: Loaded, model: StateSpaceModel, path: Path) -> tuple[LearnedCorrection, str]:
+    """Return the correction that the YAML names, and its file as errors name it.
 
     Raises:
         ConfigError: If its file is missing, is wrong, or is of another model.
     """
-    files = correction_files(loaded)
-    if not files:
-        return None, ""
-    path = files[0]
     if not path.is_file():
         raise loaded.error(("learned",), f"is {loaded.config.learned!r}; there is no file {shown_path(path)}; "
                            "`nisus learn` writes one")  # fmt: skip
@@ -40,13 +37,6 @@ def load_learned(model: StateSpaceModel, loaded: Loaded) -> tuple[LearnedCorrect
             f"{loaded.path.stem} is {model.name!r}, whose states and inputs are others; learn it anew"
         )
     return learned_of(section, path), places.at(())
-
-
-def correction_files(loaded: Loaded) -> list[Path]:
-    """Return the file of the correction that the YAML names, if it names one."""
-    if loaded.config.learned is None:
-        return []
-    return [loaded.path.absolute().parent / Path(loaded.config.learned).expanduser()]
 
 
 def learned_of(section: CorrectionSection, path: Path) -> LearnedCorrection:

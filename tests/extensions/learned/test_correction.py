@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from app.cli.open_twin import opened_twin
-from app.twin.learned import run_net
+from app.extensions.learned.correction import run_net
 from app.twin.twin import load_twin
 from estimators.errors import ConfigError
 from estimators.models import MODELS
@@ -63,7 +63,7 @@ def test_a_twin_without_is_what_it_was():
     assert bare.model.f is alone.f and bare.model.Q is alone.Q and bare.model.noises == MODELS["motor_winding"].noises
 
 
-@cases(__file__, "learned.csv")
+@cases(__file__, "refused_corrections.csv")
 def test_what_is_wrong_has_its_line(before, after, said):
     assert before in RIGHT
     assert said in error_of(ConfigError, corrected, RIGHT.replace(before, after))
