@@ -12,7 +12,7 @@ from estimators.errors import ConfigError, nearest
 from .parts import parts_of
 
 if TYPE_CHECKING:
-    from app.cli.arguments import QueryCommand
+    from .arguments import QueryCommand
 
 ALL = "archive"
 """View with the rows of all twins."""

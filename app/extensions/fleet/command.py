@@ -35,10 +35,11 @@ from .running import STOPPED, STORE, RunningFleet
 from .table import arrow_table, counts_of, fleet_topics, in_name_order, ordered
 
 if TYPE_CHECKING:
-    from app.cli.arguments import FleetCommand
     from app.web.door import Door
     from app.web.running import OpenedTwin
     from app.web.session import Session
+
+    from .arguments import FleetCommand
 
 FLEET_PRELOADED = (*PRELOADED, __name__, "pyarrow.dataset", "pyarrow.parquet")
 """Modules that the processes of a fleet and its pages share."""

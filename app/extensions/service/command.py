@@ -28,8 +28,9 @@ from .service import BLANK, Service, TwinFolder
 from .supervisor import STATUS_PERIOD_S, Supervisor, forget_safe_path
 
 if TYPE_CHECKING:
-    from app.cli.arguments import ServeCommand, ServiceOptions
     from app.web.session import Session
+
+    from .arguments import ServeCommand, ServiceOptions
 
 PRELOADED = ("app.extensions.service.preloaded",)
 """Modules that the processes of the twins share: they are imported once."""
