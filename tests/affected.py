@@ -44,7 +44,8 @@ def nearest(changes: Iterable[str], root: Path = ROOT) -> dict[str, int]:
     found: dict[str, int] = {}
     for change in changes:
         path = PurePosixPath(change)
-        found |= dict.fromkeys((change, f"tests/{path.parent}/test_{path.name}"), 0)
+        mirror = str(path.parent).removeprefix("app/" if path.parts[1:2] == ("extensions",) else "")
+        found |= dict.fromkeys((change, f"tests/{mirror}/test_{path.name}"), 0)
         if path.suffix != ".py":
             folders = [f"tests/{folder}/" for folder in path.parents[:-1]]
             near = next((folder for folder in folders if (root / folder).is_dir()), "tests/")
