@@ -89,7 +89,7 @@ def one_line(text: str) -> str:
 
 
 def page_file(name: str, settings: Mapping[str, Any], **parts: str) -> Response:
-    """Answer with an HTML file of the page, with its settings in an attribute of the body, and other parts by name.
+    """Answer with an HTML file of the page, or at a path, with settings in an attribute of the body and parts by name.
 
     In an attribute, not in a script: the security policy allows no inline scripts. Scripts and styles of a page behind
     a service are those of its `overview`, so a browser that knows them does not fetch them for each twin.

@@ -5,11 +5,13 @@ from __future__ import annotations
 import threading
 from collections import OrderedDict
 from collections.abc import Iterator
+from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 from starlette.responses import Response
-from starlette.routing import BaseRoute
+from starlette.routing import BaseRoute, Mount
+from starlette.staticfiles import StaticFiles
 
 from app.extensions.service.metrics import exposed
 from app.web import readings
@@ -27,6 +29,8 @@ if TYPE_CHECKING:
 
 MAX_ROWS = 500
 """Longest part of the table that is sent at once."""
+
+PAGE = Path(__file__).with_name("page")
 
 MAX_ORDERS = 8
 """Orders of the table that are kept, for clients that scroll."""
@@ -59,7 +63,12 @@ class FleetApi:
 
     def routes(self) -> list[BaseRoute]:
         """Return the routes."""
-        return [get("/api/fleet", self.rows), get("/metrics", self.metrics), *readings.routes(self._running)]
+        return [
+            get("/api/fleet", self.rows),
+            get("/metrics", self.metrics),
+            Mount("/fleet", StaticFiles(directory=PAGE)),
+            *readings.routes(self._running),
+        ]
 
     def page(self, boot: str) -> Response:
         """Answer with the overview."""
@@ -68,7 +77,7 @@ class FleetApi:
         sizes = {"fleet": plan.name, "title": plan.twin.title, "estimator": plan.twin.estimator, "columns": columns}
         units = units_of(plan.twin.model)
         states = [state.name for state in plan.twin.model.shown_states]
-        return page_file("fleet.html", {"boot": boot, **sizes, "units": units, "states": states})
+        return page_file(str(PAGE / "fleet.html"), {"boot": boot, **sizes, "units": units, "states": states})
 
     def rows(
         self,

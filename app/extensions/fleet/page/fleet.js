@@ -1,8 +1,8 @@
 // The assets of a fleet, the worst first. Only the rows in view are asked for and drawn.
 
-import { keys } from "./controls.js";
-import { $, element, setAttribute, setText } from "./dom.js";
-import { bracketed, compact, count, span, withDeviation } from "./format.js";
+import { keys } from "../page/controls.js";
+import { $, element, setAttribute, setText } from "../page/dom.js";
+import { bracketed, compact, count, span, withDeviation } from "../page/format.js";
 
 const POLL_MS = 1000;
 const ROW = 32; // px, as in fleet.css
