@@ -118,7 +118,8 @@ def registered(kind: Kind) -> dict[str, tuple[str, Part]]:
     """Return the parts of a kind by name, each with the name of its extension, which comes first if two have one."""
     found: dict[str, tuple[str, Part]] = {}
     for name, item in extensions().items():
-        found = {key: (name, part) for key, part in getattr(item, kind).items()} | found
+        for key, part in getattr(item, kind).items():
+            found.setdefault(key, (name, part))
     return found
 
 

@@ -12,6 +12,7 @@ from pydantic_core import ErrorDetails
 from estimators.errors import ConfigError, nearest
 
 from .extensions import left_out
+from .output_schema import ReceiverSection
 from .source_schema import PartSection, SourceSection
 from .yaml_files import Key, ValuePlaces, dotted, parse, shown_path
 
@@ -122,8 +123,9 @@ def _locate(loc: tuple[str | int, ...], data: Any) -> tuple[Key, Any]:
 
 
 def _choices(problem: ErrorDetails) -> str:
-    sections = get_args(SourceSection if problem["loc"] == ("source",) else PartSection)[0]
-    kinds = [get_args(section.model_fields["type"].annotation)[0] for section in get_args(sections)]
+    unions: dict[Any, Any] = {("source",): SourceSection, ("outputs", "receivers"): ReceiverSection}
+    sections = get_args(unions.get(problem["loc"][:2], PartSection))[0]
+    kinds = [get_args(section.model_fields["type"].annotation)[0] for section in get_args(sections) or (sections,)]
     return f"it must be one of {', '.join(kinds)}"
 
 
