@@ -87,6 +87,14 @@ Kind = Literal[
     "commands", "sources", "outputs", "receivers", "models", "corrections", "executors", "tables", "folders", "tracks",
     "archives", "pictures", "routes", "panels",
 ]  # fmt: skip
+RESERVED: Mapping[str, tuple[str, ...]] = {
+    "sources": ("simulator", "can", "can_log", "table", "merged", "push"),
+    "outputs": ("every", "covariance", "receivers"),
+    "receivers": ("webhook",),
+    "models": ("matrices",),
+}
+"""Names of the core by kind, which no extension may take; commands of the core come before those of one name."""
+
 TAGGED = ("sources", "receivers")
 """Kinds of which a section is recognised by its `type`, a literal that is the name of the part."""
 
@@ -115,11 +123,12 @@ def extensions() -> dict[str, Extension]:
 
 @cache
 def registered(kind: Kind) -> dict[str, tuple[str, Part]]:
-    """Return the parts of a kind by name, each with the name of its extension, which comes first if two have one."""
+    """Return the parts of a kind by name, each with the name of its extension; a name that is taken is reported."""
     found: dict[str, tuple[str, Part]] = {}
     for name, item in extensions().items():
         for key, part in getattr(item, kind).items():
-            found.setdefault(key, (name, part))
+            if key in RESERVED.get(kind, ()) or found.setdefault(key, (name, part)) != (name, part):
+                _report(f"extension {name}: {key} of its {kind} is left out, as there is one of that name")
     return found
 
 
@@ -167,8 +176,8 @@ def maker(kind: Kind, key: str, asked: str = "", extra: str = "") -> Callable[..
 
 def makers(kind: Kind) -> list[Callable[..., Any]]:
     """Return the functions of all parts of a kind, without those that cannot be imported."""
-    named = ((name, partial(maker, kind, key)) for key, (name, _) in registered(kind).items())
-    return [found for name, work in named if (found := _tried(name, work)) is not None]
+    references = ((name, part.make) for name, part in registered(kind).values())
+    return [found for name, make in references if (found := _tried(name, partial(pkgutil.resolve_name, make)))]
 
 
 def _tried(name: str, work: Callable[[], T]) -> T | None:
@@ -185,5 +194,12 @@ def _gist(error: BaseException) -> str:
 
 def _leave_out(found: dict[str, Any], name: str, why: str) -> None:
     found.pop(name, None)
-    if _left_out.setdefault(name, why) == why and multiprocessing.parent_process() is None:
-        logging.getLogger("nisus").warning("extension %s is left out: %s", name, why)
+    if name not in _left_out:
+        _left_out[name] = why
+        _report(f"extension {name} is left out: {why}")
+
+
+def _report(text: str) -> None:
+    """Log a line, once for all processes of a command."""
+    if multiprocessing.parent_process() is None:
+        logging.getLogger("nisus").warning(text)

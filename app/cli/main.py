@@ -84,7 +84,7 @@ def parse(arguments: Sequence[str]) -> Any:
         ConfigError: If the command or an option does not exist, or a value must be a number and is not.
     """
     name = arguments[0] if arguments else "--help"
-    commands = NAMES if name in NAMES else NAMES | schemas("commands")
+    commands = NAMES if name in NAMES else NAMES | schemas("commands") | NAMES
     if name in commands:
         command = commands[name]
         given = [*arguments[1:]]

@@ -4,6 +4,10 @@ import json
 
 import pytest
 
+from app.twin.source import SOURCES
+from config.extensions import RESERVED, registered
+from config.model_schema import KINDS
+from config.output_schema import OutputsSection
 from tests import ROOT
 from tests.support import run_python
 
@@ -99,8 +103,25 @@ def test_a_function_that_cannot_be_imported_is_one_line_for_the_twin_that_asks_f
     assert done.stderr == f"nisus: extension depth: {text}\n"
 
 
+def test_names_of_the_core_are_reserved():
+    assert {kind: {*names} for kind, names in RESERVED.items()} == {
+        "sources": {*SOURCES},
+        "outputs": {*OutputsSection.model_fields} - {*registered("outputs")},
+        "receivers": {"webhook"},
+        "models": {*KINDS} - {*registered("models")},
+    }
+
+
+def test_a_name_of_the_core_is_left_out(tmp_path, monkeypatch):
+    module = MODULE.replace('"depth"', '"table"')
+    folder = installed(tmp_path, module, "depth = nisus_depth:EXTENSION")
+    done = run(monkeypatch, folder, "from app.cli.main import main; main(['twins', 'motor_winding', '--json'])")
+    assert done.stderr == "nisus: extension depth: table of its sources is left out, as there is one of that name\n"
+
+
 def test_of_two_with_one_name_the_first_by_name_counts(tmp_path, monkeypatch):
     installed(tmp_path, MODULE, "depth = nisus_depth:EXTENSION")
     other = MODULE.replace("nisus_depth:", "nisus_other:").replace("opening.section.reading", "-1.0")
     done = run(monkeypatch, installed(tmp_path, other, "other = nisus_other:EXTENSION", name="nisus_other"), OPENED)
     assert done.stdout == "[1000000000000000000] [41.5]\n"
+    assert done.stderr == "extension other: depth of its sources is left out, as there is one of that name\n"
