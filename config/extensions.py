@@ -18,7 +18,7 @@ from functools import cache, partial
 from importlib.metadata import entry_points
 from typing import Any, Literal, NamedTuple, TypeVar, get_args
 
-from estimators.errors import ConfigError, printable, reason_of
+from estimators.errors import ConfigError, NisusError, printable, reason_of
 
 from .channels import MessagesSection
 from .fields import Section
@@ -95,6 +95,7 @@ RESERVED: Mapping[str, tuple[str, ...]] = {
 }
 """Names of the core by kind, which no extension may take; commands of the core come before those of one name."""
 
+GUARDED = ("sources", "outputs", "receivers", "models", "routes", "panels")
 TAGGED = ("sources", "receivers")
 """Kinds of which a section is recognised by its `type`, a literal that is the name of the part."""
 
@@ -113,12 +114,25 @@ def extensions() -> dict[str, Extension]:
     points = sorted(entry_points(group=GROUP), key=lambda point: point.name)
     found = {point.name: item for point in points if (item := _tried(point.name, point.load)) is not None}
     for name, item in list(found.items()):
-        if not isinstance(item, Extension):
-            _leave_out(found, name, "its entry point names no Extension")
+        if misfit := _misfit(item):
+            _leave_out(found, name, misfit)
     while lacking := {name: need for name, item in found.items() for need in item.needs if need not in found}:
         for name, need in lacking.items():
             _leave_out(found, name, f"it needs the extension {need}")
     return found
+
+
+def _misfit(item: Any) -> str:
+    """Return why an object is no extension; nothing if it is one."""
+    if not isinstance(item, Extension):
+        return "its entry point names no Extension"
+    if not isinstance(item.needs, tuple):
+        return "its needs are no tuple"
+    for kind in get_args(Kind):
+        own = getattr(item, kind)
+        if not isinstance(own, Mapping) or not all(isinstance(part, Part) for part in own.values()):
+            return f"its {kind} are no mapping from names to Part"
+    return ""
 
 
 @cache
@@ -127,7 +141,8 @@ def registered(kind: Kind) -> dict[str, tuple[str, Part]]:
     found: dict[str, tuple[str, Part]] = {}
     for name, item in extensions().items():
         for key, part in getattr(item, kind).items():
-            if key in RESERVED.get(kind, ()) or found.setdefault(key, (name, part)) != (name, part):
+            taken = key in RESERVED.get(kind, ()) or (kind == "outputs" and (key[:1] == "_" or hasattr(Section, key)))
+            if taken or found.setdefault(key, (name, part)) != (name, part):
                 _report(f"extension {name}: {key} of its {kind} is left out, as there is one of that name")
     return found
 
@@ -161,6 +176,8 @@ def _usable(reference: str, kind: Kind, key: str) -> Any:
 def maker(kind: Kind, key: str, asked: str = "", extra: str = "") -> Callable[..., Any]:
     """Return the function of a part; `asked` is what needs it, and `extra` what brings it.
 
+    In one of `GUARDED`, an error that is none of Nisus or of the system becomes a ConfigError.
+
     Raises:
         ConfigError: If no extension has it, or it cannot be imported.
     """
@@ -169,15 +186,28 @@ def maker(kind: Kind, key: str, asked: str = "", extra: str = "") -> Callable[..
         raise ConfigError(f"{asked}: {rule}{left_out()}")
     name, part = registered(kind)[key]
     try:
-        return pkgutil.resolve_name(part.make)
+        make: Callable[..., Any] = pkgutil.resolve_name(part.make)
     except Exception as error:  # noqa: BLE001  the module may be of a third party
         raise ConfigError(f"extension {name}: {_gist(error)}; install its package again") from None
 
+    def guarded(*given: Any) -> Any:
+        try:
+            found = make(*given)
+        except (NisusError, OSError):
+            raise
+        except Exception as error:  # noqa: BLE001  the function may be of a third party
+            raise ConfigError(f"extension {name}: {key} of its {kind}: {_gist(error)}") from error
+        if found is None:
+            raise ConfigError(f"extension {name}: {key} of its {kind}: its function returns nothing")
+        return found
 
-def makers(kind: Kind) -> list[Callable[..., Any]]:
-    """Return the functions of all parts of a kind, without those that cannot be imported."""
-    references = ((name, part.make) for name, part in registered(kind).values())
-    return [found for name, make in references if (found := _tried(name, partial(pkgutil.resolve_name, make)))]
+    return guarded if kind in GUARDED else make
+
+
+def made(kind: Kind, *given: Any) -> list[Any]:
+    """Return what the functions of all parts of a kind make; what fails is reported, and left out."""
+    parts = ((name, key) for key, (name, _) in registered(kind).items())
+    return [found for name, key in parts if (found := _tried(name, lambda key=key: maker(kind, key)(*given)))]
 
 
 def _tried(name: str, work: Callable[[], T]) -> T | None:
@@ -189,7 +219,7 @@ def _tried(name: str, work: Callable[[], T]) -> T | None:
 
 
 def _gist(error: BaseException) -> str:
-    return printable(reason_of(error).splitlines()[0])
+    return printable(reason_of(error).partition("\n")[0].removesuffix(": "))
 
 
 def _leave_out(found: dict[str, Any], name: str, why: str) -> None:

@@ -10,13 +10,13 @@ import time
 from collections.abc import Callable
 from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, NamedTuple, Protocol
+from typing import TYPE_CHECKING, Any, NamedTuple, Protocol, runtime_checkable
 
 import numpy as np
 
 from config.extensions import maker, registered
 from config.output_schema import AlertSection
-from estimators.errors import NisusError
+from estimators.errors import ConfigError, NisusError, printable
 
 from ..live.jobs import Jobs, LoopThread
 from ..live.outputs import OutputLink
@@ -37,10 +37,14 @@ ALIVE_PERIOD_S = 1.0
 HEALTH_RULE = AlertSection(health="suspect")
 """Rule of a twin that has receivers and no rules."""
 
+FAILED = OutputLink(False, "it fails; see the notices")
+"""Of an output that cannot tell."""
+
 RULES_PERIOD_S = 0.2
 """Between two looks at the rules of alerts."""
 
 
+@runtime_checkable
 class Output(Protocol):
     """Publishes states; no method may wait for a client or a network."""
 
@@ -113,8 +117,9 @@ class Publisher:
     def json(self) -> dict[str, Any]:
         """Return the state of outputs, receivers and alerts."""
         parts, mute = self._parts, self._engine.mute
+        links = [self._guarded(item, item.link) or FAILED for item in parts.outputs]
         return {
-            "outputs": [{"name": item.name} | item.link()._asdict() for item in parts.outputs],
+            "outputs": [{"name": item.name} | link._asdict() for item, link in zip(parts.outputs, links, strict=True)],
             "receivers": [
                 {name: getattr(item, name) for name in ("name", "failing", "waiting", "delivered", "dropped")}
                 for item in parts.deliveries.queues.values()
@@ -137,6 +142,9 @@ class Publisher:
             for key in registered("outputs")
             if (own := getattr(section, key, None)) is not None
         }
+        for key, output in outputs.items():
+            if not isinstance(output, Output):
+                raise ConfigError(f"outputs.{key}: its extension must make name, start, publish, stop and link")
         deliveries = Deliveries(section.receivers, twin.path.absolute().parent, outputs, notices, secrets)
         if deliveries.queues and not rules:
             rules = (HEALTH_RULE,)
@@ -146,7 +154,7 @@ class Publisher:
     def _begin(self) -> None:
         parts = self._parts
         for output in parts.outputs:
-            output.start()
+            self._guarded(output, output.start)
         if parts.outputs:
             self._engine.grown |= {self._grown.set}
         if parts.deliveries.queues:
@@ -158,7 +166,7 @@ class Publisher:
     def _end(self) -> None:
         self._parts.jobs.stop()
         for output in self._parts.outputs:
-            output.stop()
+            self._guarded(output, output.stop)
 
     def _run(self) -> None:
         sent, at = None, -np.inf
@@ -176,7 +184,7 @@ class Publisher:
                 continue
             sent, at = new, now
             for output in parts.outputs:
-                self._guarded(f"output {output.name}", partial(output.publish, message))
+                self._guarded(output, partial(output.publish, message))
             self._thread.stopping.wait(section.every)
 
     def _follow(self) -> None:
@@ -198,11 +206,14 @@ class Publisher:
         self._parts = parts
         self._begin()
 
-    def _guarded(self, name: str, work: Callable[[], object]) -> None:
+    def _guarded(self, output: Output, work: Callable[[], Any]) -> Any:
+        """Return the result of a method of an output; None if it fails, which is reported."""
         try:
-            work()
+            return work()
         except Exception as error:  # noqa: BLE001  no client or library may end the thread of all outputs
-            self._engine.notices.report(name, f"{name}: {type(error).__name__}: {error}", level="error")
+            name, reason = f"output {output.name}", printable(f"{type(error).__name__}: {error}".partition("\n")[0])
+            self._engine.notices.report(name, f"{name}: {reason}", level="error")
+            return None
 
     def _look(self, parts: Parts) -> None:
         """Put the alerts that are due into the queues of their receivers."""

@@ -20,7 +20,7 @@ from starlette.routing import BaseRoute, Mount, Route, WebSocketRoute
 from starlette.staticfiles import StaticFiles
 from starlette.websockets import WebSocket
 
-from config.extensions import maker, makers, registered
+from config.extensions import made, maker, registered
 from estimators.errors import ConfigError, NisusError
 
 from ..live.engine import STATUS_PERIOD_S
@@ -172,7 +172,6 @@ class PageServer:
             *readings.routes(self._engine),
             *self._runs.routes(),
             *self._fit.routes(),
-            *(make(self._engine) for make in makers("routes")),
             post("/api/command", self._command, status=202, body_schema=commands_schema),
             get("/api/forecast", self._forecasts.may, refused=409),
             post("/api/forecast", self._forecast, run=OneAtATime("forecast")),
@@ -180,7 +179,7 @@ class PageServer:
             get("/api/scene", self._scene),
             post("/api/scene", self._choose),
             get("/api/recordings", self._list_recordings),
-            get("/panels/{title}", self._panel, refused=404),
+            get("/panels/{title:path}", self._panel, refused=404),
             get("/rec/{name}", self._recording),
             Route(f"/viewer/{viewer_version()}/{{name}}", self._viewer_file),
             WebSocketRoute("/api/stream", self._page_stream),
@@ -193,7 +192,7 @@ class PageServer:
                 WebSocketRoute("/viser", self._viser.websocket),
                 Route("/viser/", self._viser.page),
             ]
-        return routes
+        return [*routes, *made("routes", self._engine)]
 
     def _page(self, name: str) -> Response:
         settings = {"viewer": f"viewer/{viewer_version()}", "boot": self._boot, "viser": self._viser is not None}
@@ -203,7 +202,7 @@ class PageServer:
 
     def _panel(self, title: str) -> Response:
         """Answer with the script of a tab that an extension adds."""
-        return Response(maker("panels", title)(), media_type="text/javascript")
+        return Response(str(maker("panels", title, f"the tab {title}", "EXTENSION")()), media_type="text/javascript")
 
     def _index(self) -> Response:
         """Answer with the page."""

@@ -75,6 +75,8 @@ BROKEN = {
     "EXTENSION = 1": "its entry point names no Extension",
     "": "AttributeError: module 'nisus_depth' has no attribute 'EXTENSION'",
     MODULE.replace("sources=", 'needs=("sonar",), sources='): "it needs the extension sonar",
+    MODULE.replace("sources={", "commands=None, sources={"): "its commands are no mapping from names to Part",
+    MODULE.replace("sources=", 'needs="sonar", sources='): "its needs are no tuple",
     MODULE.replace('Literal["depth"]', 'Literal["deep"]'): "TypeError: type of DepthSection is not Literal['depth']",
     MODULE.replace("reading: float", "reading: Unknown"): "NameError: name 'Unknown' is not defined",
     MODULE.replace("DepthSection(MessagesSection)", "DepthSection"): "TypeError: DepthSection is no MessagesSection",
@@ -96,11 +98,19 @@ def test_a_broken_one_is_a_line_and_stops_only_a_twin_that_needs_it(tmp_path, mo
     assert "is 'depth'" in told and told.endswith(f"; extensions that cannot be loaded: depth ({text})")
 
 
-def test_a_function_that_cannot_be_imported_is_one_line_for_the_twin_that_asks_for_it(tmp_path, monkeypatch):
-    module = MODULE.replace("nisus_depth:open_depth", "nisus_depth:opened")
+MADE = {
+    "opened": "AttributeError: module 'nisus_depth' has no attribute 'opened'; install its package again",
+    "broken": "depth of its sources: ZeroDivisionError: division by zero",
+    "nothing": "depth of its sources: its function returns nothing",
+}
+
+
+@pytest.mark.parametrize("name", MADE)
+def test_a_function_that_fails_is_one_line_for_the_twin_that_asks_for_it(tmp_path, monkeypatch, name):
+    module = MODULE.replace("nisus_depth:open_depth", f"nisus_depth:{name}")
+    module += "\nnothing = lambda opening: None\nbroken = lambda opening: 1 / 0\n"
     done = run(monkeypatch, installed(tmp_path, module, "depth = nisus_depth:EXTENSION"), COMMANDS)
-    text = "AttributeError: module 'nisus_depth' has no attribute 'opened'; install its package again"
-    assert done.stderr == f"nisus: extension depth: {text}\n"
+    assert done.stderr == f"nisus: extension depth: {MADE[name]}\n"
 
 
 def test_names_of_the_core_are_reserved():

@@ -74,10 +74,8 @@ settings.panels.forEach((title, k) => {
   $("side-tabs").append(element("button", { type: "button", "data-tab": `panel-${k}` }, title));
   const node = element("div", { id: `panel-${k}`, role: "tabpanel", hidden: "" });
   $("right").append(node);
-  import(new URL(`panels/${encodeURIComponent(title)}`, document.baseURI)).then(
-    (script) => script.default(node, window.nisus),
-    (error) => node.append(element("p", { class: "warning" }, `${title}: ${error.message}`)),
-  );
+  const failed = (error) => node.append(element("p", { class: "error" }, `${title}: ${error.message}`));
+  import(new URL(`panels/${encodeURIComponent(title)}`, document.baseURI)).then((script) => script.default(node, window.nisus)).catch(failed);
 });
 const side = new Tabs($("side-tabs"), "nisus.side");
 new Trust(model, link, (tab) => side.show(tab));
