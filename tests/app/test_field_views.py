@@ -31,6 +31,7 @@ from estimators.errors import ConfigError
 from estimators.log import READING
 from estimators.model.parts import Field
 from tests.app.scripted import Scripted, pull_all
+from tests.cases import cases
 from tests.support import as_log, folded
 from tests.waiting import wait_for
 
@@ -316,15 +317,7 @@ def test_only_charted_cells_are_looked_for_among_what_sensors_read(twin):
     assert twin.model.sensors[0].rows[found.row].name == "t2_3"
 
 
-@pytest.mark.parametrize(
-    ("old", "new", "error"),
-    [
-        ('cells: ["temperature[2,3]"', 'cells: ["temperature[8,3]"',
-            r"plate.yaml:16: view.cells names 'temperature\[8,3\]'"),
-        ("window: 12", 'pairs: [["temperature[2,3]", "temperature[1,1]"]]', "which is not among view.cells; add it"),
-        ("every: 5", "every: 0", "truth.every is 0"),
-    ],
-)  # fmt: skip
+@cases(__file__, "refused_views.csv")
 def test_a_view_that_cannot_be_is_refused(folder, old, new, error):
     path = folder / "plate.yaml"
     path.write_text(PLATE.replace(old, new))

@@ -4,6 +4,7 @@ import pytest
 from config.loader import load, shipped
 from config.schema import json_schema, json_schema_text
 from config.yaml_files import parse
+from tests.cases import cases
 
 VALIDATOR = jsonschema.Draft202012Validator(json_schema())
 
@@ -22,33 +23,9 @@ def test_every_twin_that_ships_satisfies_it(name):
     assert [error.message for error in VALIDATOR.iter_errors(data_of(load(name).text))] == []
 
 
-@pytest.mark.parametrize(
-    "text",
-    [
-        "model: a\nsource: {type: simulator}\nestimator: {name: kf, options: {a: 1}}",
-        "model: a\nsource: {type: simulator, inputs: {i: 3, j: [1, {sine: {amplitude: 1, period: 2}}]}}",
-        "model: a\nsource: {type: can, interface: virtual, channel: 1, dbc: [a.dbc, {file: b.dbc}]}",
-        "model: a\nsource: {type: can, interface: virtual, channel: x, dbc: {file: b.dbc, channel: 1}}",
-        "model: a\nsource: {type: table, files: a.csv, time: {column: t}, truth: {s: {columns: [a], where: {q: 1}}}}",
-        "model: a\nsource: {type: simulator}\nsensors: {s: {std: [1, 2]}}\nview: {pairs: [[a, b]]}",
-    ],
-)
-def test_short_forms_satisfy_it(text):
-    assert [error.message for error in VALIDATOR.iter_errors(data_of(text))] == []
-
-
-@pytest.mark.parametrize(
-    "text",
-    [
-        "source: {type: simulator}",
-        "model: a\nsource: {type: simulator}\ngates: 0.9",
-        "model: a\nsource: {type: simulator}\ngate: 1.5",
-        "model: a\nsource: {type: simulator}\nprior: {s: {std: -1}}",
-        "model: a\nsource: {type: simulator, dbc: a.dbc}",
-    ],
-)
-def test_mistakes_do_not(text):
-    assert list(VALIDATOR.iter_errors(data_of(text)))
+@cases(__file__, "schema_faults.csv")
+def test_short_forms_satisfy_it_and_mistakes_are_found_where_they_are(text, places):
+    assert [error.json_path for error in VALIDATOR.iter_errors(data_of(text))] == places.split()
 
 
 def test_every_key_is_described():

@@ -7,6 +7,7 @@ import pytest
 
 from estimators.errors import SourceError
 from sources.units import conversion, declared_conversion, heading_unit
+from tests.cases import cases
 from tests.support import error_of
 
 
@@ -38,15 +39,7 @@ def test_what_is_refused_says_why(given, reason):
     assert heading_unit(f"Value [{given}]") == given
 
 
-@pytest.mark.parametrize(
-    ("given", "wanted", "expected"),
-    [
-        ("km/h", "°C", "speed: 'km/h' does not convert to the model's '°C'; write one that converts, under `units`"),
-        ("g", "V", "speed: 'g' does not convert to the model's 'V'; write one that converts, under `units`"),
-        ("furz", "m", "speed: unit 'furz' is unknown, and the model's is 'm'; write one that converts, under `units`"),
-        ("-", "m", "speed: unit '-' is unknown, and the model's is 'm'; declare its `units`"),
-    ],
-)
+@cases(__file__, "no_conversions.csv")
 def test_what_does_not_convert_names_both(given, wanted, expected):
     assert error_of(SourceError, conversion, given, wanted, "speed") == expected
 

@@ -22,6 +22,7 @@ from estimators.models import MODELS
 from estimators.track import HEALTH_NAMES
 from estimators.tuning import Tuning
 from tests.app.present.export.test_report import data_of
+from tests.cases import cases
 from tests.support import measured
 
 DRIVE = """\
@@ -480,14 +481,6 @@ def test_a_part_of_the_log_is_scored_by_the_filter_that_ran_from_the_start(tmp_p
     assert [row["nis"], *row["nis_bounds"]] == pytest.approx([told["nis"][key] for key in ("mean", "low", "high")])
 
 
-@pytest.mark.parametrize(
-    ("option", "text"),
-    [
-        ("--since noon", "--since noon: give a share (50%), a time after the start (600, 10min) or a date"),
-        ("--since 2024-05-01", "--since 2024-05-01: the times of this log have no date; give seconds after its start"),
-        ("--until 130%", "--until 130%: give a share from 0% to 100%"),
-        ("--since 10min", "--since 10min: there is no measurement in this part; the log is from 0 s to 2 s"),
-    ],
-)
+@cases(__file__, "wrong_parts.csv")
 def test_a_part_without_measurements_is_one_line(option, text, tmp_path, nisus):
     assert text in nisus.refuses("fold", drive(tmp_path), *option.split())

@@ -197,14 +197,7 @@ def test_options_of_run_come_from_the_environment_unless_they_are_given(monkeypa
     assert command.set == ("Q.rate=2", "use.winding=false") and command.log == (Path("a.csv"), Path("b.csv"))
 
 
-@pytest.mark.parametrize(
-    ("variable", "value", "line"),
-    [
-        ("PROT", "1", "NISUS_RUN_PROT: there is no such option; did you mean NISUS_RUN_PORT"),
-        ("HEADLESS", "si", "NISUS_RUN_HEADLESS is 'si'; it must be 1, true, yes, on, 0, false, no, off"),
-        ("PORT", "x", "--port 'x': must be a whole number"),
-    ],
-)
+@cases(__file__, "wrong_variables.csv")
 def test_a_wrong_variable_is_one_line(nisus, monkeypatch, variable, value, line):
     monkeypatch.setenv(f"NISUS_RUN_{variable}", value)
     assert line in nisus.refuses("run", "motor_can")

@@ -23,6 +23,7 @@ from estimators.errors import ConfigError
 from sources.source import ignore
 from tests.app.outputs.pushed import push, pushed_twin
 from tests.app.scripted import notice_texts
+from tests.cases import cases
 from tests.support import error_of
 from tests.waiting import wait_for
 
@@ -273,37 +274,13 @@ def test_a_mute_is_asked_for_by_a_command(serve):
     assert "alerts are muted for 60 min: cleaning" in notice_texts(page.engine)
 
 
-OPS = '{"receivers": {"ops": {"type": "webhook", "url": "http://127.0.0.1:9/"}}}'
-
-
-@pytest.mark.parametrize(
-    ("outputs", "alerts", "text"),
-    [
-        (OPS, "[{state: windng, above: 1}]", "alerts[0].state names 'windng', no state of motor_winding"),
-        (OPS, "[{state: temperature}]", "alerts[0] gives neither above nor below"),
-        (OPS, "[{episode: stuk}]", "alerts[0].episode names 'stuk', no cause of an episode; did you mean stuck?"),
-        (OPS, "[{health: suspect, to: op}]", "alerts[0].to names 'op', no receiver under outputs.receivers"),
-        (OPS, "[{health: suspect, nis: 2}]", "alerts[0] gives both health and nis"),
-        (OPS, "[{nis: 2, above: 3}]", "belongs to a limit of a state"),
-        ("{}", "[{health: suspect}]", "alerts[0] has no receiver; name one under outputs.receivers"),
-        (OPS.replace("http:", "ftp:"), "[]", "url"),
-    ],
-)
+@cases(__file__, "refused_rules.csv")
 def test_a_rule_that_means_nothing_is_refused_in_one_line(outputs, alerts, text):
     overrides = {"outputs": outputs, "alerts": alerts}
     assert text in error_of(ConfigError, load_twin, "motor_winding", overrides=overrides)
 
 
-@pytest.mark.parametrize(
-    ("outputs", "key"),
-    [
-        ("receivers:\n    ops:\n      type: webhook\n      url: $NISUS_NO_SECRET", "receivers.ops.url"),
-        (
-            "receivers:\n    ops:\n      {type: webhook, url: http://a,\n      secret_env: NISUS_NO_SECRET}",
-            "receivers.ops.secret_env",
-        ),
-    ],
-)
+@cases(__file__, "no_secrets.csv")
 def test_a_secret_that_is_not_set_is_one_line_with_its_place(serve, outputs, key, tmp_path, monkeypatch):
     monkeypatch.delenv("NISUS_NO_SECRET", raising=False)
     text = load_twin("motor_winding").loaded.text.rstrip() + f"\noutputs:\n  {outputs}\n"

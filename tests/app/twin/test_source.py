@@ -1,4 +1,3 @@
-# ruff: noqa: E501  (a table of whole messages reads better unbroken)
 import os
 from pathlib import Path
 
@@ -6,6 +5,7 @@ import numpy as np
 import pytest
 
 from app.twin.log_reader import read_log
+from estimators import errors
 from estimators.errors import ConfigError, SourceError
 from estimators.log import INPUT, READING, TRUTH, Events
 from estimators.models import MODELS
@@ -122,20 +122,10 @@ def test_a_recording_stands_in_for_a_bus():
     assert len(of(events(twin_of(without, log_files=["data/drive.log"])), READING)) == 3
 
 
-@pytest.mark.parametrize(
-    ("old", "new", "kind", "expected"),
-    [
-        ("files: drive.log", "files: absent.log", SourceError, "motor.yaml:5: source.files is not there: data/absent.log; set NISUS_DATA to the folder that holds the recordings or give other recordings with --log FILE; to get it: ask the test bench"),
-        ("files: drive.log", "files: [drive.log, 'x*.log']", SourceError, "motor.yaml:5: source.files is not there: data/x*.log; set NISUS_DATA to the folder that holds the recordings or give other recordings with --log FILE; to get it: ask the test bench"),
-        ("dbc: thermal.dbc", "dbc: absent.dbc", SourceError, "motor.yaml:7: source.dbc is not there: data/absent.dbc; set NISUS_DATA to the folder that holds the recordings; to get it: ask the test bench"),
-        ("    winding:\n", "    windin:\n", ConfigError, "motor.yaml:9: source.sensors.windin is no sensor of motor_winding; did you mean winding?"),
-        ("signals: WindingTemp", "signals: [WindingTemp, Valid]", ConfigError, "motor.yaml:11: source.sensors.winding.signals names 2; winding takes 1: winding"),
-        ("  sensors:\n", "  inputs:\n", ConfigError, "motor.yaml:9: source.inputs.winding is no input of motor_winding; there are none to choose from"),
-    ],
-)  # fmt: skip
+@cases(__file__, "unopened.csv")
 def test_a_source_that_cannot_be_opened_is_one_line(old, new, kind, expected):
     assert old in LOG
-    assert message(LOG.replace(old, new, 1), kind) == expected
+    assert message(LOG.replace(old, new, 1), getattr(errors, kind)) == expected
 
 
 @cases(__file__, "dbc_lacks.csv")
@@ -286,17 +276,9 @@ source:
 """
 
 
-@pytest.mark.parametrize(
-    ("step", "duration", "expected"),
-    [
-        # motor_drive has three sensors.
-        ("1e-6", "600", "motor.yaml:4: source.step is 1e-06 s; the simulator would make 1.8e+09 events in 600 s, and may make 1e+08; lengthen it, or shorten source.duration"),
-        ("0.5", "1e9", "motor.yaml:5: source.duration is 1e+09 s; the simulator would make 6e+09 events in 1e+09 s, and may make 1e+08; shorten it, or lengthen source.step"),
-        ("1e-6", "null", "motor.yaml:4: source.step is 1e-06 s; the simulator would make 3e+08 events in 100 s, and may make 1e+08; lengthen it"),
-        ("1e9", "null", "motor.yaml:4: source.step is 1e+09 s; the simulator would make RUNS steps of f in 1e+09 s, and may make 1e+08; shorten it"),
-    ],
-)  # fmt: skip
+@cases(__file__, "endless.csv")
 def test_a_simulation_that_would_never_end_is_one_line(step, duration, expected):
+    # motor_drive has three sensors.
     runs = f"{1e9 / MODELS['motor_drive'].max_step:.3g}"
     text = LENGTHY.replace("STEP", step).replace("DURATION", duration)
     assert refusal(text) == expected.replace("RUNS", runs)
@@ -388,7 +370,8 @@ def test_scale_offset_and_origin_reach_the_source():
 def test_conversions_that_make_no_sense_are_one_line():
     inputs = CAR + "  inputs:\n    accel: {columns: a, convert: east_north}\n"
     assert message(inputs, ConfigError) == (
-        "motor.yaml:10: source.inputs.accel.convert is east_north; it needs two values, latitude and longitude, and 1 are named"
+        "motor.yaml:10: source.inputs.accel.convert is east_north; it needs two values, latitude and longitude, "
+        "and 1 are named"
     )
     inputs = CAR + "  inputs:\n    accel: {columns: [a, b], convert: east_north}\n"
     assert message(inputs, ConfigError) == "motor.yaml:10: source.inputs.accel.columns names 2; accel takes 1: accel"

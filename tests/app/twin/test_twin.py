@@ -1,4 +1,3 @@
-# ruff: noqa: E501  (a table of whole messages reads better unbroken)
 import os
 from pathlib import Path
 
@@ -8,6 +7,7 @@ import pytest
 from app.live.tunings.tuning_yaml import tuning_yaml
 from app.twin.twin import load_twin, restore_twin
 from config import extensions
+from estimators import errors
 from estimators.compiled.model import compile_model
 from estimators.errors import ConfigError, ModelError
 from tests.app.twin.written import refusal, twin_of
@@ -136,26 +136,10 @@ def test_a_correction_without_its_extension_is_one_line(monkeypatch):
     assert text.startswith("motor.yaml:2: learned: needs an extension; install it with `pip install 'nisus[learned]'`")
 
 
-@pytest.mark.parametrize(
-    ("python", "reference", "kind", "expected"),
-    [
-        (PUMP, "./pum.py:Pump", ConfigError, "motor.yaml:1: model is './pum.py:Pump'; there is no file pum.py; it is sought beside the YAML"),
-        (PUMP, "./pump.py:Pumpe", ConfigError, "motor.yaml:1: model is './pump.py:Pumpe'; pump.py has no Pumpe; did you mean Pump?"),
-        (PUMP, "./pump.py", ConfigError, "motor.yaml:1: model is './pump.py'; name what to take from the file, as in ./pump.py:Pump"),
-        (PUMP + "X = 3\n", "./pump.py:X", ConfigError, "motor.yaml:1: model names X, which is of type int; it must be a StateSpaceModel, or return one"),
-        (PUMP + "def X(a): pass\n", "./pump.py:X", ModelError, "pump.py: TypeError: X() missing 1 required positional argument: 'a'; correct the model's file"),
-        ("import math\nx = 1 +\n", "./pump.py:Pump", ModelError, "pump.py:2: invalid syntax; correct the Python"),
-        ("\nimport absent_module\n", "./pump.py:Pump", ModelError, "pump.py:2: ModuleNotFoundError: No module named 'absent_module'; correct the model's file"),
-        ("def g():\n    return 1 / 0\n\n\ng()\n", "./pump.py:Pump", ModelError, "pump.py:2: ZeroDivisionError: division by zero; correct the model's file"),
-        ("import sys\nsys.exit(3)\n", "./pump.py:Pump", ModelError, "pump.py:2: SystemExit: 3; correct the model's file"),
-        ("from os import _exit\n_exit(3)\n", "./pump.py:Pump", ModelError, "pump.py:2: RuntimeError: os._exit(3) would end the program; a model reports an error by raising an exception; correct the model's file"),
-        ("x = 1\x00", "./pump.py:Pump", ModelError, "pump.py: "),
-        (PUMP.replace("0.01", "-1.0"), "./pump.py:Pump", ModelError, "pump.py:13: model pump: sensor level.level has variance -1.0; it must be positive, or zero of a row without noise"),
-    ],
-)  # fmt: skip
+@cases(__file__, "failing_models.csv")
 def test_a_model_file_that_fails_is_one_line_in_the_users_code(python, reference, kind, expected):
-    Path("pump.py").write_text(python)
-    text = refusal(f"model: {reference}\nsource: {{type: simulator}}\n", kind)
+    Path("pump.py").write_text(python.replace("PUMP", PUMP).replace("NUL", "\0"))
+    text = refusal(f"model: {reference}\nsource: {{type: simulator}}\n", getattr(errors, kind))
     assert text.startswith(expected) if expected.endswith(" ") else text == expected
 
 

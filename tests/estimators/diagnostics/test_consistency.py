@@ -10,6 +10,7 @@ from estimators.diagnostics.health import JUDGED_MEAN, MEAN, VARIANCE, nis_bound
 from estimators.diagnostics.score import nis_verdict
 from estimators.log import READING, Events
 from estimators.track import GATED, USED, Track
+from tests.cases import cases
 from tests.models import FLOAT_AND_SONAR as MODEL
 
 BASELINE = np.array([[0.3, 0.5, 0.7], [0.0, 1.0, 0.0], [-0.5, 2.0, -0.4]])  # bias, scale, correlation of each row
@@ -65,22 +66,10 @@ def test_no_readings_have_no_bounds():
     assert NisVerdict(np.nan, np.nan, np.nan, False).words == "no reading to judge"
 
 
-@pytest.mark.parametrize(
-    ("nis", "commissioned", "words"),
-    [
-        (1.0, False, "mean NIS 1.00 per degree of freedom, inside its 95 % bounds 0.90 to 1.10"),
-        (1.2, False, "mean NIS 1.20 per degree of freedom, above its 95 % bounds 0.90 to 1.10"),
-        (
-            0.57,
-            True,
-            "mean NIS 0.57 per degree of freedom, below the 95 % bounds 0.90 to 1.10 of the commissioned baseline",
-        ),
-        # Numbers that differ read differently, with the same decimals.
-        (1.1004, False, "mean NIS 1.1004 per degree of freedom, above its 95 % bounds 0.9000 to 1.1000"),
-        (0.897, False, "mean NIS 0.897 per degree of freedom, below its 95 % bounds 0.900 to 1.100"),
-    ],
-)
+@cases(__file__, "nis_words.csv")
 def test_it_says_where_a_mean_lies_and_by_what(nis, commissioned, words):
+    """Numbers that differ read differently, with the same decimals."""
+    nis, commissioned = float(nis), commissioned == "True"
     assert NisVerdict(nis, 0.9, 1.1, commissioned).words == words
     # Of measurements of eight rows all three are eight times as large.
     assert NisVerdict(8 * nis, 7.2, 8.8, commissioned, dof=8.0).words == words

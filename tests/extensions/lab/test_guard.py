@@ -34,6 +34,7 @@ from config.tunings import load_version
 from estimators.diagnostics.score import score
 from estimators.errors import ConfigError
 from estimators.events.batch import truth_of
+from tests.cases import cases
 from tests.support import folded
 
 RECORDINGS = 10
@@ -323,21 +324,14 @@ def test_a_twin_without_truth_is_guarded_by_sensors_held_out(tmp_path, capsys):
     assert known.figures["rmse.yoke"].values[0] == pytest.approx(expected, rel=0.5)
 
 
-@pytest.mark.parametrize(
-    ("change", "problem"),
-    [
-        (("seeds: 1", "seeds: no"), r"w\.guard\.yaml:5: seeds is 'no'; it must be a whole number"),
-        (("seeds:", "seedz:"), r"w\.guard\.yaml:5: seedz is not known; did you mean seeds"),
-        (("values: [", "values: [1, "), r"w\.guard\.yaml:9: figures\.nis\.allowed has 3 entries; values has 4"),
-    ],
-)
-def test_recorded_scores_that_are_wrong_are_said_with_their_line(tmp_path, capsys, change, problem):
+@cases(__file__, "wrong_scores.csv")
+def test_recorded_scores_that_are_wrong_are_said_with_their_line(tmp_path, capsys, old, new, problem):
     path = twin_file(tmp_path, "w", 1)
     assert guarded(None, path, accept=True, note="first") == 0
     file = tmp_path / "w.guard.yaml"
     text = file.read_text()
-    assert change[0] in text
-    file.write_text(text.replace(*change, 1))
+    assert old in text
+    file.write_text(text.replace(old, new, 1))
     capsys.readouterr()
     assert guarded(None, path) == 2
     assert re.search(problem, said(capsys))

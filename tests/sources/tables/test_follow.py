@@ -21,6 +21,7 @@ from sources.tables.table import Table
 from sources.tables.times import TimeColumn
 from tests.app.scripted import pull_all
 from tests.app.twin.written import refusal, twin_of
+from tests.cases import cases
 from tests.support import as_log, assert_same, error_of, folded, read_all
 
 CHANNEL = Channel(READING, 0, "winding", ("w",))
@@ -178,14 +179,7 @@ def test_a_restart_from_a_store_takes_no_row_twice(tmp_path):
     running.stop()
 
 
-@pytest.mark.parametrize(
-    ("more", "text"),
-    [
-        ("files: log.parquet, follow: true", "log.parquet: it cannot be read as Parquet"),
-        ("files: bad.csv, follow: true", "motor.yaml:2: source.sensors.winding: .*there is no column 'w'"),
-        ("files: log.csv, follow: 3", "motor.yaml:2: source.follow"),
-    ],
-)
+@cases(__file__, "not_followed.csv")
 def test_what_cannot_be_followed_is_one_line(tmp_path, monkeypatch, more, text):
     monkeypatch.chdir(tmp_path)
     (tmp_path / "log.parquet").write_bytes(b"PAR1")
