@@ -17,6 +17,7 @@ from estimators.model.parts import Limits
 from estimators.model.state_space import Input, Noise, State
 from estimators.track import DIVERGED, GATED, TRACKING, USED, WAITING
 from estimators.tuning import Tuning
+from tests.cases import cases
 from tests.models import level_model, unchanged
 from tests.support import SECOND, as_log
 from tests.support import folded as advanced
@@ -81,99 +82,48 @@ def spiked(x, z, rng):
     return x + 0.2 * z
 
 
-SENSORS = {
-    "shifted": (
-        {"gauge": lambda x, z, rng: x + 0.4 + 0.2 * z},
-        ("gauge", "σ", 0.4, 2.0),
-        "reads 0.",
-        "above the prediction since",
-        "the sensor, an input or a parameter is biased; hold gauge out to compare",
-    ),
-    "narrow": (
-        {"gauge": lambda x, z, rng: x + 0.6 * z},
-        ("gauge", "×", 1.8, 3.2),
-        "bands of gauge are too narrow since",
-        "times as large as predicted; increase R.gauge, or check the sensor for added noise",
-    ),
-    "wide": (
-        {"gauge": lambda x, z, rng: x + 0.04 * z},
-        ("gauge", "×", 0.1, 0.6),
-        "bands of gauge are too wide since",
-        "times as large as predicted; reduce R.gauge",
-    ),
-    "correlated": (
-        {"gauge": lambda x, z, rng: x + 0.2 * noise(rng, len(x), 0.7)[:, None]},
-        ("gauge", "", 0.2, 0.8),
-        "innovations of gauge are correlated (+0.",
-        "increase Q.level, or add the missing state to the model",
-    ),
-    "alternating": (
-        {"gauge": lambda x, z, rng: x + 0.2 * noise(rng, len(x), -0.7)[:, None]},
-        ("gauge", "", -0.9, -0.4),
-        "innovations of gauge alternate in sign (-0.",
-        "reduce Q.level; the estimate follows the noise",
-    ),
-    "spiky": (
-        {"gauge": spiked},
-        ("gauge", "", 0.04, 0.09),
-        "gauge has spikes since",
-        "% of its measurements are outliers; check the wiring, and set a gate unless the asset jumps",
-    ),
-    "refused": (
-        {"gauge": lambda x, z, rng: x + 5.0 + 0.2 * z, "gate": 0.9999},
-        ("gauge", "", 0.99, 1.0),
-        "gauge is rejected by the gate since",
-        "(100 % of its measurements): the sensor or the twin is wrong; hold gauge out to see whether the other sensors "
-        "agree",
-    ),
-    "stuck": (
-        {"gauge": lambda x, z, rng: np.full_like(x, 0.125)},
-        ("gauge", "m", 0.125, 0.125),
-        "gauge is stuck at 0.125 m since",
-        "other sensors measure the same states; hold it out until it is repaired",
-    ),
-    "disagreeing": (
-        {"chain": lambda x, z, rng: x + 1.16 * z},
-        ("chain", "×", 1.12, 1.2),
-        "rows of chain contradict each other since",
-        "increase R.chain, or check which of them is wrong",
-    ),
-    "agreeing": (
-        {"chain": lambda x, z, rng: x + 0.8 * z},
-        ("chain", "×", 0.77, 0.83),
-        "rows of chain are closer to the prediction than their noise since",
-        "reduce R.chain",
-    ),
+SENSORS: dict[str, dict] = {
+    "shifted": {"gauge": lambda x, z, rng: x + 0.4 + 0.2 * z},
+    "narrow": {"gauge": lambda x, z, rng: x + 0.6 * z},
+    "wide": {"gauge": lambda x, z, rng: x + 0.04 * z},
+    "correlated": {"gauge": lambda x, z, rng: x + 0.2 * noise(rng, len(x), 0.7)[:, None]},
+    "alternating": {"gauge": lambda x, z, rng: x + 0.2 * noise(rng, len(x), -0.7)[:, None]},
+    "spiky": {"gauge": spiked},
+    "refused": {"gauge": lambda x, z, rng: x + 5.0 + 0.2 * z, "gate": 0.9999},
+    "stuck": {"gauge": lambda x, z, rng: np.full_like(x, 0.125)},
+    "disagreeing": {"chain": lambda x, z, rng: x + 1.16 * z},
+    "agreeing": {"chain": lambda x, z, rng: x + 0.8 * z},
 }
+"""Changes of `folded` that make a fault, by its cause; the first is of the sensor that has it."""
+
 FAR = 45
 """Seconds by which a weak fault's begin and end are known: see test_effects.py, twice the correlated one's."""
 
 
-@pytest.mark.parametrize("cause", SENSORS)
-def test_one_fault_of_a_sensor_is_one_episode(cause):
-    fault, (subject, unit, least, most), *words = SENSORS[cause]
-    fold = folded(**fault)
+@cases(__file__, "sensor_faults.csv")
+def test_one_fault_of_a_sensor_is_one_episode(cause, subject, unit, least, most, words):
+    fold = folded(**SENSORS[cause])
     # What a wrong sensor does to the estimate, the others contradict: that is an episode of theirs.
     found = [each for each in episodes(fold) if each.subject.startswith(subject)]
     assert [each.cause for each in found] == [cause]
     (each,) = found
     assert each.unit == unit
-    assert least <= each.size <= most and not each.low > each.size and not each.high < each.size
+    assert float(least) <= each.size <= float(most) and not each.low > each.size and not each.high < each.size
     assert abs(each.start - BEGIN - 1) <= FAR and each.end is not None and abs(each.end - END) <= FAR
-    for part in words:
+    for part in words.split(" … "):
         assert part in each.text
     assert "\n" not in each.text and each.text[-1] != "."
 
 
 def test_one_that_lasts_for_more_readings_than_its_size_is_made_of_ends_where_it_ended(monkeypatch):
     monkeypatch.setattr("estimators.diagnostics.episodes.sensors.MAX_MEASUREMENTS", 60)
-    (each,) = (item for item in episodes(folded(**SENSORS["narrow"][0])) if item.subject == "gauge")
+    (each,) = (item for item in episodes(folded(**SENSORS["narrow"])) if item.subject == "gauge")
     assert each.end is not None and abs(each.end - END) <= FAR
 
 
 @pytest.mark.parametrize("cause", ["refused", "stuck"])
 def test_what_is_certain_has_its_readings_exactly(cause):
-    (each,) = (item for item in episodes(folded(**SENSORS[cause][0])) if item.cause == cause)
+    (each,) = (item for item in episodes(folded(**SENSORS[cause])) if item.cause == cause)
     # Until the last reading that was refused, or equal.
     assert (each.start, each.end) == (BEGIN + 1.0, float(END))
 
@@ -345,7 +295,7 @@ def test_json_has_every_field_and_no_nan():
 
 def test_numbers_are_those_of_python():
     for cause in ("shifted", "stuck"):
-        for each in episodes(folded(**SENSORS[cause][0])):
+        for each in episodes(folded(**SENSORS[cause])):
             assert {type(value) for value in each} <= {float, str, type(None)}
 
 
@@ -402,9 +352,10 @@ def test_a_reset_is_advised_only_when_no_sensor_is_off():
 @pytest.mark.parametrize(("cause", "factor"), [*((cause, np.nan) for cause in SENSORS), ("stuck", 1e9)])
 def test_a_row_without_a_possible_value_tells_nothing(cause, factor):
     """Episodes are as if it were not there: each tenth in the fault, and without a value all that end it."""
-    fold = folded(**SENSORS[cause][0])
+    fold = folded(**SENSORS[cause])
     events, t = fold.log.events, fold.log.events.t // SECOND
-    rows = (events.kind == READING) & (events.channel == MODEL.sensor_names.index(SENSORS[cause][1][0])) & (t > BEGIN)
+    sensor = MODEL.sensor_names.index(next(iter(SENSORS[cause])))
+    rows = (events.kind == READING) & (events.channel == sensor) & (t > BEGIN)
     tenth, ending = rows & (t % 10 == 5), rows & (t > END - 40)
     faulty = events.copy()
     faulty.value[tenth] *= factor
@@ -461,20 +412,13 @@ def test_the_onset_of_an_episode_is_not_before_the_reset_nor_in_the_episode_befo
     assert found[1].start == pytest.approx(cut + 100, abs=10)
 
 
-@pytest.mark.parametrize(
-    ("states", "said"),
-    [
-        (("x",), "x is measured by no other sensor"),
-        (("x", "y"), "x and y are measured by no other sensor"),
-        (("x", "y", "z"), "x, y and z are measured by no other sensor"),
-    ],
-)
+@pytest.mark.parametrize(("states", "said"), [("x", "x is"), ("xy", "x and y are"), ("xyz", "x, y and z are")])
 def test_states_that_one_sensor_alone_observes_are_listed(states, said):
     model = level_model(
         {"total": 1.0}, 1.0, h=total, states=tuple(State(name, "1") for name in states), f=unchanged,
         noises=(Noise(states[0], "1/s", 1.0),),
     )  # fmt: skip
-    assert SensorFacts(cause="silent", start=0.0, model=model, s=0).observed_by == said
+    assert SensorFacts(cause="silent", start=0.0, model=model, s=0).observed_by == f"{said} measured by no other sensor"
 
 
 def total(x, u, p, out):

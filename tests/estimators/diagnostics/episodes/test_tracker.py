@@ -14,7 +14,7 @@ from estimators.log import READING
 from tests.estimators.diagnostics.episodes.test_find import SENSORS, folded
 
 FAULTS = {
-    **{cause: SENSORS[cause][0] for cause in SENSORS},
+    **SENSORS,
     "silent": {"skip": (0,)},
     "outside": {"feed": 3.0},
     "gap": {},
@@ -80,7 +80,7 @@ def test_a_gap_of_a_recording_without_any_event_is_an_episode():
 
 @pytest.mark.parametrize("cause", [*SENSORS, "corrected"])
 def test_rows_that_are_dropped_do_not_move_the_ends(cause):
-    judged, subject = rows_with(cause), SENSORS[cause][1][0] if cause in SENSORS else "level"
+    judged, subject = rows_with(cause), next(iter(SENSORS[cause])) if cause in SENSORS else "level"
     (expected,) = (item for item in tracked(judged, 65_536, [1000]) if item.subject.startswith(subject))
     (found,) = (item for item in tracked(judged, 1501, [1000]) if item.subject.startswith(subject))
     assert (found.cause, found.start) == (expected.cause, expected.start)
