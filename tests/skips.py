@@ -53,16 +53,16 @@ def recording(*parts: str) -> Path:
     return path if path.exists() else skip_without("recordings")
 
 
-def recorded(name: str) -> tuple[Any, Any]:
-    """Return a bundled twin and its own log; skip the test where the recording is absent."""
+def recorded(name: Any, duration: float | None = None, **options: Any) -> tuple[Any, Any]:
+    """Return a twin by name or path and its own log, or what it has of it in seconds; see `with_recording`."""
     from app.twin.log_reader import read_log
 
-    twin = with_recording(name)
-    return twin, read_log(twin, None)[0]
+    twin = with_recording(name, **options)
+    return twin, read_log(twin, duration)[0]
 
 
-def with_recording(name: str, **options: Any) -> Any:
-    """Return a bundled twin, loaded; skip the test where its recording is absent."""
+def with_recording(name: Any, **options: Any) -> Any:
+    """Return a twin, loaded with options of `load_twin`; skip the test where its recording is absent."""
     from app.twin.source import missing
     from app.twin.twin import load_twin
 

@@ -12,7 +12,7 @@ from estimators.compiled.model import compile_model
 from estimators.diagnostics.innovations import jarque_bera, ljung_box
 from estimators.model.state_space import Noise, Parameter, Row, Sensor, State, StateSpaceModel
 from estimators.models.lorenz import LORENZ63, LORENZ96
-from tests.estimators.fit.test_plain import NILE, NILE_FLOW, TREND, fitted_to
+from tests.estimators.fit.test_search import NILE, NILE_FLOW, TREND, fitted_to
 
 Figures = dict[str, Any]
 

@@ -1,4 +1,4 @@
-"""The command line: lazy imports, and errors of writing that name what was written."""
+"""The command line: lazy imports, arguments refused before long work, errors of writing that name what was written."""
 
 import json
 import re
@@ -14,6 +14,7 @@ from app.cli import arguments
 from app.cli.main import described, main, parse
 from config.extensions import maker, registered, schemas
 from config.loader import shipped
+from estimators.registry import ESTIMATORS
 from tests import ROOT
 from tests.cases import cases
 from tests.support import run_python
@@ -214,3 +215,16 @@ def test_every_line_of_a_service_is_json(tmp_path):
     lines = [json.loads(line) for line in told.stderr.splitlines()]
     assert lines and all(line.keys() >= {"time", "level", "text"} for line in lines)
     assert any("a new one; the twin continues" in line["text"] for line in lines)
+
+
+@cases(__file__, "bad_arguments.csv")
+def test_a_wrong_argument_is_one_line(said, command, nisus, tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    assert said.replace("ESTIMATORS", ", ".join(ESTIMATORS)) in nisus.refuses(*shlex.split(command))
+    assert not list(tmp_path.iterdir())
+
+
+@pytest.mark.parametrize("more", ["", "--windows 60"])
+def test_an_unknown_entry_is_refused_before_anything_is_compiled(more, nisus, monkeypatch):
+    monkeypatch.setattr("app.cli.tune.prepare", lambda twin: pytest.fail("it was compiled"))
+    assert "p.nosuch is no entry" in nisus.refuses("tune", "motor_bench", "--fit", "p.nosuch", *more.split())

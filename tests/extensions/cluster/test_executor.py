@@ -24,7 +24,7 @@ from estimators.fit.fit import fit
 from estimators.fit.objective import Cancelled
 from estimators.fit.recording import Recording
 from tests import ROOT
-from tests.app.studies.test_fit_executor import bits
+from tests.app.studies.test_processes import bits
 from tests.waiting import LIMIT_S
 
 NAME, OVERRIDES = "motor_winding", {"R.winding": "0.2"}

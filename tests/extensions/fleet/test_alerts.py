@@ -1,4 +1,4 @@
-"""Alerts of fleets: each asset is in alarm as a twin of its own would be, and those of a moment are one message."""
+"""Alerts of fleets: an asset is in alarm as a twin would be, those of a moment are one message; after a restart too."""
 
 import json
 from types import SimpleNamespace
@@ -6,20 +6,20 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
-from app.extensions.fleet.alerts import MAX_LISTED, FleetRules
-from app.extensions.fleet.plan import load_fleet
+from app.extensions.fleet.alerts import MAX_ABSENCE_S, MAX_LISTED, FleetRules
 from app.extensions.fleet.publisher import FleetPublisher
-from app.extensions.fleet.running import RunningFleet
 from app.extensions.fleet.schema import FleetAlertSection
-from app.outputs.alerts import AlertRules
+from app.outputs.alerts import SETTLE_S, AlertRules
 from app.web.readings import messages_of
 from config.output_schema import AlertSection
 from estimators.errors import ConfigError
 from estimators.fleet.fleet import Fleet
 from estimators.models import MODELS
 from estimators.track import HEALTH_NAMES
+from tests.app.outputs.test_alert_store import restarted
 from tests.app.outputs.test_alerts import state
 from tests.cases import cases
+from tests.extensions.fleet.test_running import fleet_of, running
 from tests.support import error_of
 from tests.waiting import wait_for
 
@@ -124,16 +124,10 @@ def test_an_asset_that_recovers_before_it_was_in_a_message_is_in_none():
     assert rules.at(40.0, "degraded", "tracking") is None
 
 
-def started(folder, outputs, alerts=()):
-    path = folder / "pumps.yaml"
-    given = {"twin": "motor_winding", "source": {"type": "push"}, "outputs": outputs, "alerts": [*alerts]}
-    path.write_text(json.dumps(given))
-    return RunningFleet(load_fleet(path), lambda *_: None, threads=1)
-
-
 def test_silent_assets_are_one_alert_of_a_receiver_which_is_resolved(tmp_path, hook, capsys):
     rule = {"health": "degraded", "after": 0, "clear": 0, "group": 0}
-    fleet = started(tmp_path, {"every": 0.05, "receivers": {"log": hook.section}}, [rule])
+    outputs = {"every": 0.05, "receivers": {"log": hook.section}}
+    fleet, _ = running(tmp_path, outputs=outputs, alerts=[rule])
     publisher, source = FleetPublisher(fleet, page="http://127.0.0.1:1"), messages_of(fleet)
 
     def send(first, last, assets):
@@ -166,7 +160,8 @@ def test_silent_assets_are_one_alert_of_a_receiver_which_is_resolved(tmp_path, h
 
 
 def test_a_fleet_that_stands_still_does_not_tell_that_it_runs(tmp_path):
-    fleet = started(tmp_path, {"every": 0.01, "receivers": {"log": {"type": "webhook", "url": "http://127.0.0.1:1"}}})
+    receivers = {"log": {"type": "webhook", "url": "http://127.0.0.1:1"}}
+    fleet, _ = running(tmp_path, outputs={"every": 0.01, "receivers": receivers})
     publisher, source, beats = FleetPublisher(fleet), messages_of(fleet), []
     publisher._deliveries.beat = lambda *_: beats.append(1)
     source.send([{"asset": "a", "values": {"winding": 40.0}}])
@@ -189,5 +184,87 @@ def test_a_fleet_that_stands_still_does_not_tell_that_it_runs(tmp_path):
 
 @cases(__file__, "refused_alerts.csv")
 def test_a_wrong_rule_or_receiver_is_one_line(outputs, alerts, text, tmp_path):
-    said = error_of(ConfigError, started, tmp_path, json.loads(outputs), json.loads(alerts))
+    given = {"outputs": json.loads(outputs), "alerts": json.loads(alerts)}
+    said = error_of(ConfigError, running, tmp_path, **given)
     assert text in said and "pumps.yaml:1" in said
+
+
+def test_assets_in_alarm_are_known_after_a_restart_in_any_order():
+    rule = {"health": "degraded", "after": 5.0, "clear": 10.0, "group": 0.0, "repeat": 3600.0}
+    bad, good = "degraded", "tracking"
+    before = Looked(**rule)
+    assert before.at(0.0, bad, bad, good, bad) is None
+    first = before.at(5.0, bad, bad, good, bad)
+    before.now = 105.0
+    after = restarted(before, 500.0, at=50.0, make=Looked, **rule)
+
+    def at(t, **health):
+        """Look at assets that come in another order than before."""
+        after.now = t
+        names = [name.replace("_", " ") for name in health]
+        found = after.rules.look(names, table(list(health.values()))._replace(assets=names))
+        return found[0][1] if found else None
+
+    # Parts of the fleet start one after another; one does not report any more.
+    assert at(50.0, pump_1=bad) is None
+    assert at(60.0, pump_1=bad, pump_2=good, pump_0=good) is None
+    # One has recovered 10 s after that, which waits for the other one, or for the next message.
+    assert at(85.0, pump_1=bad, pump_2=good, pump_0=good) is None
+    assert at(90.0, pump_1=bad, pump_2=bad, pump_0=good) is None
+    message = at(95.0, pump_1=bad, pump_2=bad, pump_0=good)
+    assert (message.status, message.id, message.since) == ("firing", first.id, first.since)
+    assert (message.fired, message.recovered, message.value) == (("pump 2",), ("pump 0",), 3.0)
+    message = at(50.0 + MAX_ABSENCE_S, pump_1=bad, pump_2=bad, pump_0=good)
+    assert (message.status, message.id, message.value) == ("repeated", first.id, 2.0)
+    assert message.recovered == ("pump 3",) and message.text.endswith("; 1 asset recovered")
+    assert at(200.0, pump_1=good, pump_2=good, pump_0=good).status == "resolved"
+    assert not after.rules.state()
+    # An asset that is new, before any other is known again, belongs to the same alert.
+    after = restarted(before, 0.0, make=Looked, **rule)
+    assert at(0.0, pump_9=bad) is None and at(5.0, pump_9=bad).id == first.id
+
+
+def test_a_fleet_repeats_and_resolves_after_a_restart():
+    rule = {"health": "degraded", "after": 0.0, "clear": 0.0, "group": 0.0, "repeat": 60.0}
+    before = Looked(**rule)
+    first = before.at(0.0, "degraded", "tracking")
+    after = restarted(before, 40.0, make=Looked, **rule)
+    assert after.at(0.0, "degraded", "tracking") is None and after.at(19.0, "degraded", "tracking") is None
+    again = after.at(20.0, "degraded", "tracking")
+    assert (again.status, again.id, again.fired) == ("repeated", first.id, ())
+    # Without the state of the assets, nothing is known of one that has not reported.
+    later = restarted(after, 0.0, make=Looked, **rule)
+    assert later.at(0.0, "waiting", "waiting") is None and later.at(50.0, "waiting", "tracking") is None
+    assert later.at(59.0, "tracking", "tracking") is None
+    last = later.at(50.0 + SETTLE_S, "tracking", "tracking")
+    assert (last.status, last.id, last.recovered) == ("resolved", first.id, ("pump 0",))
+    other = restarted(after, 0.0, make=Looked, health="stale", group=0.0)
+    assert other.at(0.0, "degraded", "tracking") is None
+    last = other.at(SETTLE_S + 10.0, "degraded", "tracking")
+    assert (last.status, last.id, last.text) == ("resolved", first.id, "the rule health-degraded was removed")
+    assert not other.rules.state()
+
+
+def test_a_fleet_resolves_after_a_restart_with_its_assets_in_another_order(tmp_path, hook, monkeypatch):
+    monkeypatch.setattr("app.extensions.fleet.alerts.SETTLE_S", 0.0)
+    outputs = {"every": 0.02, "receivers": {"log": hook.section}}
+    plan = fleet_of(tmp_path, outputs=outputs, alerts=[{"health": "degraded", "after": 0, "clear": 0, "group": 0}])
+
+    def run(names, health, count):
+        now = table(health)._replace(assets=names)
+        fleet = SimpleNamespace(plan=plan, failure="", table=lambda: (1, names, now))
+        publisher = FleetPublisher(fleet, store=tmp_path / "pumps.store")
+        publisher.start()
+        try:
+            wait_for(lambda: len(hook.alerts) == count)
+        finally:
+            publisher.stop()
+
+    run(["a", "b", "c"], ["degraded", "tracking", "stale"], 1)
+    run(["c", "a", "b", "d"], ["tracking", "tracking", "tracking", "degraded"], 2)
+    run(["d", "b", "c", "a"], ["tracking"] * 4, 3)
+    alerts = hook.alerts
+    assert [alert["status"] for alert in alerts] == ["firing", "firing", "resolved"]
+    assert len({alert["id"] for alert in alerts}) == 1
+    assert (alerts[1]["fired"], alerts[1]["recovered"]) == (["d"], ["c", "a"])
+    assert not np.isin(["a", "b", "c"], alerts[2]["recovered"]).any()

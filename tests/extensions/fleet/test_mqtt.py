@@ -1,22 +1,19 @@
 """States and alerts of a fleet over MQTT: a topic for each asset, and only what has changed."""
 
-import json
 from dataclasses import replace
 from types import SimpleNamespace
 
 import numpy as np
 import pytest
 
-from app.extensions.fleet.plan import load_fleet
 from app.extensions.fleet.publisher import FleetPublisher
-from app.extensions.fleet.running import RunningFleet
 from app.extensions.fleet.state import ChangedAssets, asset_message
 from app.present.state_message import StateMessage
 from app.twin.twin import load_twin
 from app.web.readings import messages_of
 from estimators.track import HEALTH_NAMES
 from tests.extensions.fleet.test_alerts import table
-from tests.extensions.fleet.test_running import folded
+from tests.extensions.fleet.test_running import folded, running
 from tests.extensions.mqtt.broker import Listener
 from tests.waiting import wait_for
 
@@ -28,9 +25,7 @@ LEVELS = ("pump 1", "hall%2Fpump%2B2", "50 %25")
 def started(folder, broker, **more):
     mqtt = {"host": "127.0.0.1", "port": broker.port}
     outputs = {"every": 0.05, "mqtt": mqtt, "receivers": {"broker": {"type": "mqtt"}}}
-    path = folder / "pumps.yaml"
-    path.write_text(json.dumps({"twin": "motor_winding", "source": {"type": "push"}, "outputs": outputs, **more}))
-    return RunningFleet(load_fleet(path), lambda *_: None, threads=1)
+    return running(folder, outputs=outputs, **more)[0]
 
 
 def send(fleet, first, last, assets):

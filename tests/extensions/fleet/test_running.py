@@ -36,15 +36,16 @@ from tests.support import as_log, error_of, run_python
 from tests.waiting import LIMIT_S, wait_for
 
 BEGIN, SECOND = 1_767_225_600 * 10**9, 10**9
+PUSH = MappingProxyType({"type": "push"})
 
 
-def fleet_of(folder, source=MappingProxyType({"type": "push"}), **more):
+def fleet_of(folder, source=PUSH, **more):
     path = folder / "pumps.yaml"
     path.write_text(json.dumps({"twin": "motor_winding", "source": {**source}, **more}))
     return load_fleet(path)
 
 
-def running(folder, source, **more):
+def running(folder, source=PUSH, **more):
     said: list[str] = []
     found = RunningFleet(fleet_of(folder, source, **more), lambda key, text: said.append(text), threads=1)
     return found, said
@@ -66,7 +67,7 @@ def folded(values):
 
 @pytest.mark.parametrize("kind", sorted(READERS))
 def test_messages_have_the_asset_as_a_field_in_any_form(kind, tmp_path):
-    fleet, _ = running(tmp_path, {"type": "push"})
+    fleet, _ = running(tmp_path)
     source = messages_of(fleet)
     sent = [message(k, asset, 40.0 + k + j) for k in range(6) for j, asset in enumerate(("a", "b/c"))]
     if "arrow" in kind:
@@ -91,7 +92,7 @@ def test_messages_have_the_asset_as_a_field_in_any_form(kind, tmp_path):
 
 
 def test_what_became_of_messages_is_told_by_asset(tmp_path):
-    fleet, _ = running(tmp_path, {"type": "push"})
+    fleet, _ = running(tmp_path)
     source = messages_of(fleet)
     times = [[*range(100, 140)], [138, 140, 101, 102], [10**11]]
     expected = [["used"] * 40, ["late", "used", "stale", "stale"], ["waiting"]]
@@ -106,7 +107,7 @@ def test_what_became_of_messages_is_told_by_asset(tmp_path):
 
 
 def test_messages_without_the_name_of_an_asset_are_refused(tmp_path):
-    fleet, said = running(tmp_path, {"type": "push"}, assets=["a"])
+    fleet, said = running(tmp_path, assets=["a"])
     source = messages_of(fleet)
     wrong = [{"values": {"winding": 1.0}}, message(0, "", 1.0), message(0, 7, 1.0), message(0, "x" * 201, 1.0),
              message(0, "\u200b\t ", 1.0),
@@ -134,7 +135,7 @@ class Watch:
 
 
 def test_one_more_asset_takes_the_place_of_one_with_a_single_message_or_is_refused(tmp_path):
-    fleet, said = running(tmp_path, {"type": "push"}, assets=3)
+    fleet, said = running(tmp_path, assets=3)
     source = messages_of(fleet)
 
     def send(*assets, k=0):
@@ -159,7 +160,7 @@ def test_one_more_asset_takes_the_place_of_one_with_a_single_message_or_is_refus
     for name, k in (("d", 2), ("ahead", 10**9), ("e", 3), ("g", 4)):
         assert send(name, k=k)[0] == 200
     assert fleet.names == ["e", "b", "g"] and fleet.counts[FORGOTTEN] == 4 and "'a' is forgotten" in said[0]
-    assert fleet._guard.held == 0 and running(tmp_path, {"type": "push"})[0]._most == 100_000
+    assert fleet._guard.held == 0 and running(tmp_path)[0]._most == 100_000
     table = fleet.table()[2]
     np.testing.assert_array_equal(table.mean, [folded([40.0] * count).mean for count in (1, 2, 1)])
     assert table.events.tolist() == [1, 2, 1]
@@ -173,7 +174,7 @@ def test_one_more_asset_takes_the_place_of_one_with_a_single_message_or_is_refus
 
 
 def test_an_asset_that_is_silent_becomes_stale_by_the_clock_of_the_receiver(tmp_path, monkeypatch):
-    fleet, _ = running(tmp_path, {"type": "push"})
+    fleet, _ = running(tmp_path)
     source, watch, rng = messages_of(fleet), Watch(fleet, monkeypatch), np.random.default_rng(2)
     for k in range(60):
         watch.ns = BEGIN + k * SECOND
@@ -332,7 +333,7 @@ def test_a_store_on_a_full_disk_is_tried_again_while_the_fleet_goes_on(tmp_path,
     monkeypatch.setattr(live, "STORE_PERIOD_S", 0.0)
     monkeypatch.setattr(live, "STORE_SHARE", 1e9)
     monkeypatch.setattr(live, "RETRY_PERIOD_S", 0.0)
-    first, said = running(tmp_path, {"type": "push"})
+    first, said = running(tmp_path)
     path = tmp_path / "fleet.store"
     fleet = RunningFleet(first.plan, lambda key, text: said.append(text), threads=1, store=path)
     fleet.archive = SimpleNamespace(put=lambda at, events: archived.append(len(events)), stop=lambda: None)
@@ -359,7 +360,7 @@ def test_a_store_on_a_full_disk_is_tried_again_while_the_fleet_goes_on(tmp_path,
 
 def test_a_fleet_that_stands_still_refuses_messages_and_is_not_ready(tmp_path, monkeypatch):
     """Also those that it had accepted, but neither folded nor stored."""
-    fleet, said = running(tmp_path, {"type": "push"})
+    fleet, said = running(tmp_path)
     fleet._store = SimpleNamespace(path="fleet.store", write_blocks=lambda blocks: None, close=lambda: None)
     api = FleetApi(fleet)
     assert api.unready() == "no measurement has arrived"

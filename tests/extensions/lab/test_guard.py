@@ -1,7 +1,11 @@
-"""`nisus guard`: a planted regression is caught, reruns are silent, and what cannot be compared is said."""
+"""`nisus guard`: a planted regression is caught, reruns are silent, and what cannot be compared is said.
+
+What the commands of the extension refuse is one line with the option or subject, its value and a remedy.
+"""
 
 import json
 import re
+import shlex
 import shutil
 import xml.etree.ElementTree as ET
 
@@ -374,3 +378,11 @@ def test_a_recording_that_cannot_be_read_leaves_the_others(archive, capsys):
     assert main(["guard", "--archive", str(archive), "--jobs", "1"]) == 2
     said = capsys.readouterr().out
     assert f"{RECORDINGS} recordings," in said and "broken: " in said and "broken.rrd: cannot be read" in said
+
+
+@cases(__file__, "bad_arguments.csv")
+def test_a_wrong_argument_is_one_line(said, command, nisus, tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setattr(guard_suite, "guard_log", lambda *_: pytest.fail("it was folded"))
+    assert said in nisus.refuses(*shlex.split(command))
+    assert not list(tmp_path.iterdir())
