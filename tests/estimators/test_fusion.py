@@ -1,11 +1,14 @@
 """Covariance intersection: against a numeric minimisation, and its bound for every correlation of the errors."""
 
+import json
+
 import numpy as np
 import pytest
 from scipy.optimize import minimize_scalar
 
 from estimators import covariance_intersection, fuse
 from estimators.errors import EstimatorError
+from tests.cases import cases
 from tests.support import error_of
 
 FORMS = {"det": np.linalg.det, "trace": np.trace}
@@ -100,18 +103,9 @@ def test_errors_of_two_filters_with_shared_noise():
     assert nees(N1, N2, naive) > 1.2
 
 
-@pytest.mark.parametrize(
-    ("means", "covs", "text"),
-    [
-        (np.zeros((3, 2)), np.zeros((3, 2, 2)), "must be (2, n) and (2, n, n)"),
-        (np.zeros((2, 2)), np.zeros((2, 3, 3)), "must be (2, n) and (2, n, n)"),
-        (np.zeros((2, 1)), [[[1.0]], [[0.0]]], "covs[1] is not symmetric and positive definite"),
-        (np.zeros((2, 2)), [np.eye(2), [[1.0, 0.5], [0.0, 1.0]]], "covs[1] is not symmetric"),
-        ([[np.nan], [1.0]], np.ones((2, 1, 1)), "must be finite"),
-    ],
-)
+@cases(__file__, "unfusible.csv")
 def test_estimates_that_cannot_be_fused_are_refused(means, covs, text):
-    assert text in error_of(EstimatorError, covariance_intersection, means, covs)
+    assert text in error_of(EstimatorError, covariance_intersection, json.loads(means), json.loads(covs))
 
 
 def message(twin, mean, cov, **fields):
@@ -160,24 +154,10 @@ def test_angles_are_fused_across_the_turn():
     np.testing.assert_allclose([fused.mean[0], fused.difference[0]], [-np.pi + 0.1, -0.4])
 
 
-INVALID = {"name": "tooth", "unit": "°C", "value": None, "std": None, "valid": False, "reason": "no data for 3 s"}
-
-
-@pytest.mark.parametrize(
-    ("other", "options", "text"),
-    [
-        ({**HEAVY, "version": "2"}, {}, "the second message has version '2'"),
-        ({**HEAVY, "time_ns": 2 * 10**9}, {}, "times 1 s apart, limit 0 s"),
-        ({**HEAVY, "covariance": None}, {}, "ask for /api/state?covariance=true"),
-        ({**HEAVY, "states": [INVALID]}, {}, "tooth is not valid (no data for 3 s)"),
-        ({**HEAVY, "states": [{**INVALID, "unit": "K"}]}, {}, "share no state of equal name and unit"),
-        ({**HEAVY, "states": [{**INVALID, "unit": "K"}]}, {"same": {"tooth": "tooth"}}, "must have one unit"),
-        (HEAVY, {"same": {"tooht": "tooth"}}, "has no state 'tooht'; did you mean tooth"),
-        (HEAVY, {"circular": ["magnet"]}, "circular names 'magnet', which is not shared"),
-    ],
-)
-def test_messages_that_cannot_be_fused_are_refused(other, options, text):
-    assert text in error_of(EstimatorError, fuse, EDGE, other, **options)
+@cases(__file__, "unfusible_messages.csv")
+def test_messages_that_cannot_be_fused_are_refused(changes, options, text):
+    other = HEAVY | json.loads(changes)
+    assert text in error_of(EstimatorError, fuse, EDGE, other, **json.loads(options))
 
 
 def test_times_may_differ_by_what_is_allowed():

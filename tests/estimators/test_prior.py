@@ -1,5 +1,7 @@
 """A prior given as a mean and a covariance: correlated, singular, certain; in every filter."""
 
+import json
+
 import numpy as np
 import pytest
 
@@ -9,6 +11,7 @@ from estimators.log import READING, RESET, Events, Log
 from estimators.models import MODELS
 from estimators.registry import ESTIMATORS, unfit
 from estimators.tuning import Tuning
+from tests.cases import cases
 from tests.estimators.linear_models import random_linear
 from tests.support import SECOND, log_of
 
@@ -102,20 +105,10 @@ def test_a_reset_goes_back_to_it(name):
         np.testing.assert_array_equal(a, b)
 
 
-@pytest.mark.parametrize(
-    "prior, text",
-    [
-        ((np.zeros(2), np.eye(2)), "mean has shape .2,.; linear has 3 states"),
-        ((np.zeros(3), np.ones(3)), "cov has shape .3,.; for linear it must be .3, 3."),
-        ((np.zeros(3), np.array([[1.0, 2, 0], [2, 1, 0], [0, 0, 1]])), "eigenvalue -1 .*positive semidefinite"),
-        ((np.zeros(3), np.array([[1.0, 0.5, 0], [0, 1, 0], [0, 0, 1]])), "x0 and x1 is 0.5, and 0 the other way"),
-        ((np.zeros(3), np.diag([1.0, -1.0, 1.0])), "positive semidefinite"),
-        ((np.array([0.0, np.nan, 0.0]), np.eye(3)), "finite"),
-        ((np.zeros(3), np.diag([1.0, np.inf, 1.0])), "finite"),
-        (np.zeros(3), "must be .mean, cov."),
-    ],
-)
+@cases(__file__, "no_priors.csv")
 def test_what_is_no_prior_is_refused(prior, text):
+    given = json.loads(prior)
+    prior = tuple(map(np.array, given)) if isinstance(given[0], list) else np.array(given)
     with pytest.raises(EstimatorError, match=text):
         Fold("kf", MODEL, Tuning.of(MODEL), Log.of(MODEL), prior=prior)
 

@@ -2,7 +2,6 @@
 
 import asyncio
 import json
-import math
 
 import pytest
 from starlette.requests import Request
@@ -13,6 +12,7 @@ from app.web.http import get, parse, post
 from app.web.streams import PageMessage
 from estimators.errors import ConfigError
 from estimators.models import MODELS
+from tests.cases import cases
 from tests.support import error_of
 
 
@@ -34,21 +34,19 @@ def test_a_body_that_is_no_json_is_refused(body):
     assert status == 400 and "the body is no JSON" in text
 
 
+def keep(run: int, name: str, note: str = "") -> list:
+    return [run, name, note]
+
+
 def test_a_body_becomes_arguments():
     assert answer(post("/api/x", lambda body: body), b"[1]") == (200, "[1]")
-
-    def keep(run: int, name: str, note: str = "") -> list:
-        return [run, name, note]
-
     assert answer(post("/api/x", keep, status=202), b'{"run": 3, "name": "a"}') == (202, '[3,"a",""]')
-    for body, words in (
-        ({"run": "3", "name": "a"}, "x: run is '3'; it must be a whole number"),
-        ({"run": 3}, "x: name is missing; it takes run, name, note"),
-        ({"run": 3, "nam": "a"}, "nam is not known; did you mean name?"),
-        ([], "it must be an object of run, name, note"),
-    ):
-        status, text = answer(post("/api/x", keep), json.dumps(body).encode())
-        assert status == 400 and words in json.loads(text)["error"]
+
+
+@cases(__file__, "refused_bodies.csv")
+def test_a_body_that_breaks_a_rule_is_refused(body, words):
+    status, text = answer(post("/api/x", keep), body.encode())
+    assert status == 400 and words in json.loads(text)["error"]
 
 
 def test_a_message_may_leave_out_what_has_a_default():
@@ -65,17 +63,9 @@ def test_a_query_becomes_arguments():
     assert status == 409 and "x: run is 'three'; it must be a whole number" in text
 
 
-@pytest.mark.parametrize(
-    "body",
-    [
-        None, [], {"columns": "mean:rate"}, {"columns": ["mean:nothing"]}, {"columns": ["mean:rate"] * 401},
-        {"columns": [], "points": 1}, {"columns": [], "points": 2.5}, {"columns": [], "points": True},
-        {"columns": [], "since": "now"}, {"columns": [], "span": math.inf}, {"columns": [], "until": math.nan},
-        {"columns": [], "since": 1e12}, {"columns": [], "run": 3},
-    ],
-    ids=str,
-)  # fmt: skip
+@cases(__file__, "refused_queries.csv")
 def test_a_chart_query_that_breaks_a_rule_is_refused(body):
     columns = columns_of(MODELS["motor_winding"])
-    text = error_of(ConfigError, lambda: ChartStream("x", parse(ChartQuery, body, "stream x"), columns))
+    query = json.loads(body.replace('"MANY"', json.dumps(["mean:rate"] * 401)))
+    text = error_of(ConfigError, lambda: ChartStream("x", parse(ChartQuery, query, "stream x"), columns))
     assert text.startswith("stream x: ")

@@ -1,5 +1,6 @@
 """Process and sensor noise: roots of covariances, noise that depends on the state, and steps in which it adds up."""
 
+import json
 from dataclasses import replace
 from fractions import Fraction
 
@@ -16,6 +17,7 @@ from estimators.model.parts import correlation_of, covariance_of
 from estimators.model.state_space import Noise, Row, Sensor, State, StateSpaceModel
 from estimators.tuning import Tuning
 from sources.simulator import Simulator
+from tests.cases import cases
 from tests.estimators.linear_models import random_linear
 from tests.estimators.test_fold import in_python
 from tests.models import first_state, level_model, unchanged
@@ -49,19 +51,10 @@ def test_integrated_white_noise_and_zero():
     assert fine and np.all(L == 0)
 
 
-@pytest.mark.parametrize(
-    "A",
-    [
-        [[1.0, 0.0], [0.0, -1e-3]],
-        [[0.0, 1.0], [1.0, 0.0]],
-        [[1.0, 2.0], [2.0, 1.0]],
-        [[np.nan, 0.0], [0.0, 1.0]],
-        # The second has no variance but the first one's, of which the third knows nothing: eigenvalue -0.005.
-        [[1.0, 1.0, 0.0], [1.0, 1.0, 0.1], [0.0, 0.1, 1.0]],
-    ],
-)
+@cases(__file__, "no_covariances.csv")
 def test_what_is_no_covariance_is_refused_visibly(A):
-    fine, L = root(np.array(A))
+    """The second of three has no variance but the first one's, of which the third knows nothing: eigenvalue -0.005."""
+    fine, L = root(np.array(json.loads(A)))
     assert not fine and np.all(np.isnan(L))
 
 
@@ -156,21 +149,10 @@ def test_a_sensor_holds_any_matrix_so_that_models_compare():
     assert model(C) != model(None)
 
 
-@pytest.mark.parametrize(
-    ("correlation", "message"),
-    [
-        (np.eye(2), "has 2 rows of 2, 2; it must be 3 × 3"),
-        ([[1.0]], "has 1 rows of 1; it must be 3 × 3"),
-        (2.0 * np.eye(3), "must be finite, with ones on its diagonal; of a covariance R give R_ij"),
-        (np.full((3, 3), np.nan), "must be finite"),
-        (np.eye(3) + 0.1 * np.eye(3, k=1), "is not symmetric; fill both triangles alike"),
-        (np.ones((3, 3)), "is not positive definite"),
-        (1.1 * np.eye(3) - 0.1 + 0.9 * (np.eye(3) - 1.0), "is not positive definite"),
-    ],
-)
+@cases(__file__, "no_correlations.csv")
 def test_what_is_no_correlation_is_refused(correlation, message):
     with pytest.raises(ModelError, match=rf"model three: the correlation of sensor three .*{message}"):
-        model(correlation)
+        model(json.loads(correlation))
 
 
 def test_the_simulator_draws_correlated_noise():

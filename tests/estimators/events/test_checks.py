@@ -1,5 +1,7 @@
 """The log's door: what no model has a place for is refused, and the log stays as it was."""
 
+import json
+
 import numpy as np
 import pytest
 
@@ -10,6 +12,7 @@ from estimators.model.state_space import Input, Noise, Row, Sensor, State, State
 from estimators.models import MODELS
 from estimators.snapshots import Base
 from estimators.tuning import Tuning
+from tests.cases import cases
 from tests.models import first_state, first_states
 from tests.support import SECOND
 
@@ -166,19 +169,10 @@ def test_a_log_of_another_model_is_checked_against_the_fold_s():
         fold("ekf", MODELS["motor_winding"], Tuning.of(MODELS["motor_winding"]), log)
 
 
-@pytest.mark.parametrize(
-    "pairs, text",
-    [
-        (np.array([[0, 10**9]]), "name state 1000000000"),
-        (np.array([[-1, 0]]), "name state -1"),
-        (np.array([[0.0, 1.0]]), "hold float64"),
-        (np.array([0, 1]), "shape"),
-        (np.array([[0, 1, 1]]), "shape"),
-    ],
-)
+@cases(__file__, "no_pairs.csv")
 def test_pairs_of_states_that_are_not_there(pairs, text):
     with pytest.raises(EstimatorError, match=text):
-        Fold("ekf", TWO, Tuning.of(TWO), Log.of(TWO), pairs=pairs)
+        Fold("ekf", TWO, Tuning.of(TWO), Log.of(TWO), pairs=np.array(json.loads(pairs)))
 
 
 def test_a_tuning_of_another_model():

@@ -1,5 +1,6 @@
 """Fleets against single folds: every asset has the bits of a `Fold` over its own log."""
 
+import json
 import re
 from dataclasses import replace
 
@@ -14,6 +15,7 @@ from estimators.fold import Fold
 from estimators.log import READING, TRUTH, Events
 from estimators.model.state_space import Parameter
 from estimators.track import GATED, HEALTH_NAMES
+from tests.cases import cases
 from tests.models import level_model
 from tests.support import error_of, folded, measured
 
@@ -369,17 +371,16 @@ def test_a_degraded_asset_whose_sensors_need_not_report_is_silent():
     assert table.cause.tolist() == ["silent", "stuck"]
 
 
+@cases(__file__, "refused_fleets.csv")
+def test_a_fleet_that_cannot_be_is_one_line(estimator, options, words):
+    assert words in error_of(EstimatorError, Fleet, estimator, MODELS["motor_winding"], **json.loads(options))
+
+
 @pytest.mark.parametrize(
     ("call", "words"),
     [
-        (lambda m: Fleet("pf", m, assets=2), "Gaussian"),
         (lambda m: Fleet("kf", m, replace(Tuning.of(m), gate=0.99), assets=2, recent=0), "gate.reopen is 30 s"),
         (lambda m: Fleet("kf", m, [Tuning.of(m)] * 3, assets=2), "3 tunings for 2 assets"),
-        (lambda m: Fleet("kf", m, assets=0), "0 assets"),
-        (lambda m: Fleet("kf", m, assets=2, values={"R.winding": [1.0]}), "R.winding has shape"),
-        (lambda m: Fleet("kf", m, assets=["a", "b"], values={"R.winding": [1.0, -1.0]}), "asset b: R.winding is -1"),
-        (lambda m: Fleet("kf", m, assets=2, values={"R.windin": [1.0, 1.0]}), "R.windin is not a tuning key"),
-        (lambda m: Fleet("kf", m, assets=2, values={"use.winding": [1.0, 0.0]}), "same for all assets"),
         (lambda m: Fleet("kf", m, [Tuning.of(m)] * 2, assets=2, values={"R.winding": [1.0, 2.0]}), "values and a"),
         (lambda m: Fleet("kf", m, assets=["a", "b"]).add("winding", "c", 1.0, 2.0), 'no asset'),
         (lambda m: Fleet("kf", m, assets=2).add("winding", 2, 1.0, 2.0), "asset is 2"),

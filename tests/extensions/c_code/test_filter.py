@@ -1,5 +1,6 @@
 """Exported C against the fold, compiled by the C compiler; single precision against a bound on its rounding errors."""
 
+import json
 import re
 import subprocess
 
@@ -11,6 +12,7 @@ from app.extensions.c_code.filter import export_c
 from app.twin.log_reader import read_log
 from app.twin.twin import load_twin
 from estimators.errors import ConfigError
+from tests.cases import cases
 from tests.skips import program, with_recording
 from tests.support import error_of
 
@@ -143,18 +145,9 @@ def test_single_precision_stays_within_the_bound_on_its_rounding_errors(compiler
     assert SINGLE < max(mean, std) <= worst < 0.01
 
 
-@pytest.mark.parametrize(
-    ("name", "overrides", "message"),
-    [
-        ("motor_winding", {"estimator": "ukf"}, "ukf cannot be written as C; choose one of kf, kf-steady, ekf"),
-        ("motor_winding", {"gate": "{probability: 0.99, kind: soft}"},
-            "a soft gate cannot be written as C; use --set gate"),
-        ("gripper_contact", {"estimator": "ekf"}, "a black box and a model with a mode have no formulas"),
-        ("motor_can", {"estimator": "ekf", "filters.ekf.robust": "huber"}, "the option robust cannot be written as C"),
-    ],
-)  # fmt: skip
+@cases(__file__, "unwritten.csv")
 def test_what_cannot_be_written_says_why(name, overrides, message):
-    twin = load_twin(name, overrides=overrides)
+    twin = load_twin(name, overrides=json.loads(overrides))
     text = error_of(ConfigError, export_c, twin.name, twin.estimator, twin.model, twin.tuning, None, 1)
     assert text.startswith(f"{name}: {message}")
 

@@ -13,6 +13,7 @@ import pytest
 from app.extensions.cluster import workers
 from app.studies.processes import results
 from estimators.errors import ConfigError
+from tests.cases import cases
 from tests.extensions.cluster.conftest import started
 from tests.waiting import wait_for
 
@@ -126,15 +127,7 @@ def test_a_cluster_of_ones_own_ends_with_the_command():
     wait_for(lambda: not set(multiprocessing.active_children()) - before)
 
 
-@pytest.mark.parametrize(
-    ("options", "text"),
-    [
-        ({"cluster": "local:0"}, "--cluster local:0: give 1 to 256 processes, for example local:4"),
-        ({"cluster": "local:1000"}, "--cluster local:1000: give 1 to 256 processes, for example local:4"),
-        ({"cluster": "local:²"}, "--cluster local:²: give 1 to 256 processes, for example local:4"),
-        ({"cluster": "nowhere"}, "--cluster nowhere: .*; give the address of a Dask scheduler, as in .*, or local:4"),
-    ],
-)  # fmt: skip
-def test_a_wrong_cluster_is_one_line(options, text):
+@cases(__file__, "wrong_clusters.csv")
+def test_a_wrong_cluster_is_one_line(cluster, text):
     with pytest.raises(ConfigError, match=text):
-        list(results(handled, [(), ()], **options))
+        list(results(handled, [(), ()], cluster=cluster))

@@ -188,22 +188,10 @@ def test_positions_become_metres_from_the_first_valid_fix(tmp_path):
     np.testing.assert_array_equal(later.value[0], batch.value[2])
 
 
-@pytest.mark.parametrize(
-    ("channel", "expected"),
-    [
-        (sensor(0, "ENGIN", "Temp"), "test.dbc: there is no message 'ENGIN'; did you mean ENGINE?"),
-        (sensor(0, "ENGINE", "Temperature"), "test.dbc: message ENGINE has no signal 'Temperature'; did you mean Temp"),
-        (
-            sensor(0, "ENGINE", "Temp", where=(Condition("Okay", 1, 1),)),
-            "test.dbc: message ENGINE has no signal 'Okay'; did you mean Ok",
-        ),
-        (
-            sensor(0, "ENGINE", "Temp", model_units=("m/s",)),
-            "sensor0: Temp: 'degC' does not convert to the model's 'm/s'",
-        ),
-    ],
-)
-def test_what_the_dbc_lacks_is_one_line(tmp_path, channel, expected):
+@cases(__file__, "dbc_lacks.csv")
+def test_what_the_dbc_lacks_is_one_line(tmp_path, message, signal, where, unit, expected):
+    more = {"where": (Condition(where, 1, 1),)} if where else {}
+    channel = sensor(0, message, signal, **more, **({"model_units": (unit,)} if unit else {}))
     assert error_of(SourceError, decoding, tmp_path, [channel]).startswith(expected)
 
 

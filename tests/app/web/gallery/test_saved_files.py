@@ -15,6 +15,7 @@ from app.web.running import stamp_of
 from estimators.model.user_file import imported_beside
 from tests.app.scripted import pull_all
 from tests.app.web.gallery.opened import opened
+from tests.cases import cases
 from tests.support import as_log
 from tests.waiting import wait_for
 
@@ -247,22 +248,11 @@ def test_a_file_is_read_once_it_stays_as_it_is(pump):
     assert len(read) == 2 and [call.args[1] for call in running.engine.reload.mock_calls] == ["pump.yaml saved"]
 
 
-@pytest.mark.parametrize(
-    "changed, says",
-    [
-        (YAML.replace("0.01", "0.02"), None),
-        (YAML.replace("kf", "{name: ukf, options: {alpha: 0.5}}"), None),
-        (YAML + "gate: 0.99\n", None),
-        (YAML + "prior: {temperature: {mean: 20}}\n", None),
-        (YAML + "view: {window: 5}\n", "its `view` changed"),
-        (YAML + "time: {horizon: 1}\n", "its `time` changed"),
-        (YAML.replace("step: 0.1", "step: 0.2"), "its `source` changed"),
-    ],
-)
-def test_what_a_running_fold_can_take_over(pump, changed, says):
+@cases(__file__, "taken_over.csv")
+def test_what_a_running_fold_can_take_over(pump, old, new, says):
     before = load_twin(pump)
-    save(pump, changed)
-    assert obstacle(before, load_twin(pump)) == says
+    save(pump, YAML.replace(old, new) if old else YAML + new)
+    assert obstacle(before, load_twin(pump)) == (says or None)
 
 
 def test_another_model_is_another_shape(pump):
