@@ -18,6 +18,7 @@ from estimators.errors import ConfigError
 from estimators.fold import fold
 from estimators.track import DIVERGED
 from tests.cases import cases
+from tests.skips import recorded
 from tests.support import error_of
 
 TWIN = """\
@@ -131,8 +132,7 @@ def test_a_twin_is_commissioned_against_white_innovations_whatever_was_normal_be
     path = drive(tmp_path, TWIN + "commissioned:\n  winding: {scale: 50}\n")
     y = 40.0 + np.random.default_rng(1).normal(0.0, 40.0, 300)
     (tmp_path / "drive.csv").write_text("t,y\n" + "".join(f"{k},{value:.3f}\n" for k, value in enumerate(y)))
-    twin = load_twin(path)
-    log, _ = read_log(twin, None)
+    twin, log = recorded(path)
 
     def lost(tuning):
         return float(np.mean(fold(twin.estimator, twin.model, tuning, log, policy=twin.policy).health == DIVERGED))

@@ -14,6 +14,7 @@ from estimators.errors import ConfigError
 from estimators.log import MAINTENANCE, TICK
 from estimators.track import STALE
 from tests.app.scripted import Stepped, pull_all, readings
+from tests.skips import recorded
 from tests.support import as_log, folded
 
 TWIN = """
@@ -152,8 +153,7 @@ def test_a_gap_has_rows_of_the_prediction_and_changes_no_other(tmp_path, gap, de
         f"model: motor_winding\nestimator: {estimator}\ntime: {{degraded_after: {degraded}, stale_after: 300}}\n"
         "source: {type: table, files: log.csv, time: {column: t}, sensors: {winding: {columns: y}}}\n"
     )
-    twin = load_twin(path)
-    log, _ = read_log(twin, None)
+    twin, log = recorded(path)
     replayed = Stepped()  # degraded after 5 s
     replayed.put(readings(times, np.full(len(times), 40.0)))
     assert (pull_all(replayed.engine).events.kind == TICK).sum() == (20 if gap > 10 else 0)

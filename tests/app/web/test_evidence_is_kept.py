@@ -11,9 +11,10 @@ from app.present.export.report import Reported, report
 from app.present.export.track_file import rows_of_run
 from app.twin.twin import load_twin
 from app.web.running import OpenedTwin
-from app.web.session import Page, Session
+from app.web.session import Session
 from tests.app.cli.test_check import ParsedHtml
 from tests.app.served import Client
+from tests.app.web.page.browsed import running
 from tests.waiting import wait_for
 
 FAULT = "[{kind: bias, sensor: yoke, size: 6, start: 100}]"
@@ -21,19 +22,15 @@ FAULT = "[{kind: bias, sensor: yoke, size: 6, start: 100}]"
 
 @pytest.fixture(scope="module")
 def session():
-    twin = load_twin("motor_joint", overrides={"source.duration": "200.0", "faults": FAULT})
-    running = Session(OpenedTwin(twin, live_source(twin, np.inf)), page=Page(0, open_browser=False))
-    running.start()
-    engine = running.engine
-    wait_for(lambda: engine.status().finished)
-    wait_for(lambda: any(item.subject == "yoke" for item in engine.episodes()))
-    for revision, (key, value) in enumerate((("use.yoke", False), ("Q.winding", 0.02)), start=1):
-        engine.submit(SetTuning(key, value))
-        wait_for(
-            lambda n=revision: engine.status().revision == n and engine._watchers.episode_log.summary.revision == n
-        )
-    yield running
-    running.stop()
+    with running("motor_joint", **{"source.duration": "200.0", "faults": FAULT}) as session:
+        engine = session.engine
+        wait_for(lambda: any(item.subject == "yoke" for item in engine.episodes()))
+        for revision, (key, value) in enumerate((("use.yoke", False), ("Q.winding", 0.02)), start=1):
+            engine.submit(SetTuning(key, value))
+            wait_for(
+                lambda n=revision: engine.status().revision == n and engine._watchers.episode_log.summary.revision == n
+            )
+        yield session
 
 
 def test_what_it_reads_is_said_beside_the_light_and_is_the_mean_of_its_last_innovations(session):

@@ -10,15 +10,12 @@ import pytest
 
 from app.cli.arguments import FoldCommand
 from app.cli.fold import fold_twin
-from app.cli.open_twin import live_source
 from app.live.commands import Load, Maintenance, SetTuning
 from app.present.export import track_file
-from app.twin.twin import load_twin
-from app.web.running import OpenedTwin
-from app.web.session import Page, Session
 from tests.app.cli.test_check import ParsedHtml
 from tests.app.scripted import pull_all
 from tests.app.served import Client
+from tests.app.web.page.browsed import running
 from tests.waiting import wait_for
 
 TWIN = "motor_joint"
@@ -29,12 +26,8 @@ OWN = ("arrival_ns", "tuning_version")
 
 @pytest.fixture(scope="module")
 def session():
-    twin = load_twin(TWIN, overrides={"source.duration": str(SECONDS)})
-    running = Session(OpenedTwin(twin, live_source(twin, np.inf)), page=Page(0, open_browser=False))
-    running.start()
-    wait_for(lambda: running.engine.status().finished)
-    yield running
-    running.stop()
+    with running(TWIN, **{"source.duration": str(SECONDS)}) as session:
+        yield session
 
 
 @pytest.fixture(scope="module")

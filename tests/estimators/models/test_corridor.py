@@ -3,13 +3,12 @@
 import numpy as np
 import pytest
 
-from app.twin.log_reader import read_log
-from app.twin.twin import load_twin
 from estimators.compiled.model import compile_model
 from estimators.fold import Fold
 from estimators.log import TRUTH, Log, truth_of
 from estimators.models.agv_corridor import AGV_CORRIDOR, OUTLINE, WALLS
 from estimators.tuning import Tuning
+from tests.skips import recorded
 from tests.support import folded
 
 ROOMS = ((-24, 24, -1.5, 1.5), (-12, -10, -3, -1.5), (10, 12, 1.5, 3), (-5.2, -4, 1.5, 3))
@@ -88,8 +87,7 @@ def test_slopes_of_beams_match_central_differences():
 
 @pytest.fixture(scope="module")
 def drive():
-    twin = load_twin("agv_corridor")
-    log, _ = read_log(twin, None)
+    twin, log = recorded("agv_corridor")
     return twin, log
 
 
@@ -132,8 +130,7 @@ def test_particles_keep_both_peaks_until_the_door_and_then_settle(drive, estimat
 
 
 def narrow(**overrides):
-    twin = load_twin("agv_corridor", overrides=overrides)
-    log, _ = read_log(twin, None)
+    twin, log = recorded("agv_corridor", overrides=overrides)
     return twin, log
 
 

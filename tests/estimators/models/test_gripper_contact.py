@@ -5,11 +5,10 @@ from functools import lru_cache
 import numpy as np
 import pytest
 
-from app.twin.log_reader import read_log
-from app.twin.twin import load_twin
 from estimators.compiled.model import compile_model
 from estimators.log import truth_of
 from estimators.models.gripper_contact import CONTACT, DEPTH, GRIPPER_CONTACT, SURFACE, chances
+from tests.skips import recorded
 from tests.support import folded
 
 P = GRIPPER_CONTACT.default_parameters
@@ -19,8 +18,7 @@ SEEDS = (1, 2, 3, 4)
 @lru_cache
 def contact(name, seed, particles=300, duration=15.0):
     """Estimates and truth of contact, of a filter over the twin's simulation, and the fold."""
-    twin = load_twin("gripper_contact", overrides={"source.seed": str(seed)})
-    log, _ = read_log(twin, duration)
+    twin, log = recorded("gripper_contact", overrides={"source.seed": str(seed)}, duration=duration)
     tuning = twin.tuning.with_options({"particles": particles} if name in ("rbpf", "pf") else {})
     run = folded(name, twin.model, log, tuning)
     rows, truth = truth_of(log.events, CONTACT)
@@ -64,8 +62,7 @@ def test_a_slip_does_not_move_the_finger():
 
 def test_simulated_jumps_follow_the_chances():
     """How often each step's chances came true: the sum of (jump - chance) over its standard deviation is N(0, 1)."""
-    twin = load_twin("gripper_contact", overrides={"source.seed": "9"})
-    log, _ = read_log(twin, None)
+    twin, log = recorded("gripper_contact", overrides={"source.seed": "9"})
     states = np.array([truth_of(log.events, j)[1] for j in range(5)]).T
     assert set(np.unique(states[:, CONTACT])) == {0.0, 1.0}
     miss, variance = 0.0, 0.0

@@ -9,11 +9,10 @@ import pytest
 
 from app.cli.main import main
 from app.extensions.c_code.filter import export_c
-from app.twin.log_reader import read_log
 from app.twin.twin import load_twin
 from estimators.errors import ConfigError
 from tests.cases import cases
-from tests.skips import program, with_recording
+from tests.skips import program, recorded
 from tests.support import error_of
 
 WARNINGS = ("-std=c99", "-Wall", "-Wextra", "-Werror", "-pedantic", "-O2")
@@ -28,8 +27,7 @@ def compiler():
 
 
 def exported(name, duration=None, events=2000, **overrides):
-    twin = with_recording(name, overrides=overrides)
-    log, _ = read_log(twin, duration)
+    twin, log = recorded(name, overrides=overrides, duration=duration)
     return twin, log, export_c(twin.name, twin.estimator, twin.model, twin.tuning, log, events)
 
 

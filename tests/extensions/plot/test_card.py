@@ -13,8 +13,7 @@ from app.cli.main import main
 from app.extensions.plot import card
 from app.extensions.plot.track import hex_color
 from app.present.drawing.colors import ESTIMATE, LIGHT, Scale, gradient
-from app.twin.log_reader import read_log
-from app.twin.twin import load_twin
+from tests.skips import recorded
 from tests.support import folded
 
 SVG = "{http://www.w3.org/2000/svg}"
@@ -29,8 +28,7 @@ def paths(svg, color):
 
 def drawn(name, **overrides):
     """The picture of a twin, its log, and the fold that it shows."""
-    twin = load_twin(name, overrides=overrides)
-    log, _ = read_log(twin, None)
+    twin, log = recorded(name, overrides=overrides)
     fold = folded(twin.estimator, twin.model, log, twin.tuning, pairs=twin.pairs)
     return card.picture_of(twin, log), log, fold
 

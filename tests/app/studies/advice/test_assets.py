@@ -13,6 +13,7 @@ from estimators.log import READING
 from estimators.registry import find_entry
 from tests.app.studies.advice import recordings
 from tests.app.studies.advice.recordings import write
+from tests.skips import recorded
 
 
 @pytest.fixture(scope="module")
@@ -22,8 +23,7 @@ def told(tmp_path_factory):
 
     def ask(name: str, model: str, make, sensor: str, estimator: str = "kf") -> Advice:
         if name not in known:
-            twin = load_twin(write(folder, name, model, estimator, make, sensor))
-            known[name] = advise(Measured(twin, read_log(twin, None)[0]))
+            known[name] = advise(Measured(*recorded(write(folder, name, model, estimator, make, sensor))))
         return known[name]
 
     return ask
@@ -134,8 +134,9 @@ def test_an_error_that_lasts_is_found_with_its_size_and_time(told, tmp_path):
 @pytest.mark.parametrize("number", [1, 2])
 def test_of_few_readings_nothing_is_said_of_the_innovations(tmp_path, number):
     """Two of which the second is far off bear no band out, and tell none wrong either."""
-    twin = load_twin(write(tmp_path, "few", "LINEAR", "kf", recordings.linear, "rail"))
-    log = read_log(twin, 0.5 if number == 1 else 1.5)[0]
+    twin, log = recorded(
+        write(tmp_path, "few", "LINEAR", "kf", recordings.linear, "rail"), duration=0.5 if number == 1 else 1.5
+    )
     assert int((log.events.kind == READING).sum()) == number
     found = advise(Measured(twin, log)).claim("consistent")
     assert found.answer == UNTOLD and found.remedy == ""
@@ -143,8 +144,7 @@ def test_of_few_readings_nothing_is_said_of_the_innovations(tmp_path, number):
 
 def test_faults_of_a_sensor_are_left_out(tmp_path, nisus):
     path = write(tmp_path, "stuck", "LINEAR", "kf", recordings.stuck, "rail")
-    twin = load_twin(path)
-    log = read_log(twin, None)[0]
+    twin, log = recorded(path)
     clean, excluded = without_faults(twin, log)
     begin, end = recordings.STUCK.start, recordings.STUCK.stop
     assert excluded == (Exclusion("rail", "stuck", begin, end - 1, end - begin),)
@@ -155,8 +155,7 @@ def test_faults_of_a_sensor_are_left_out(tmp_path, nisus):
 
 
 def test_what_lasts_for_most_of_the_log_is_no_fault(tmp_path):
-    twin = load_twin(write(tmp_path, "linear", "LINEAR", "kf", recordings.linear, "rail"))
-    log = read_log(twin, None)[0]
+    twin, log = recorded(write(tmp_path, "linear", "LINEAR", "kf", recordings.linear, "rail"))
 
     def shifted(start, end):
         return Episode(start, end, "rail", "shifted", 2.0, 1.5, 2.5, "σ", "")
