@@ -29,10 +29,12 @@ HEADER = 100  # bytes of an SQLite file, among them a count of its openings
 class Session:
     """A running twin without threads, on a scripted source, and its store."""
 
-    def __init__(self, path, source=None, twin=None):
+    def __init__(self, path, source=None, twin=None, **options):
+        """`options` are those of `OpenedTwin`."""
         self.source = source or Scripted(live=True)
         self.twin = twin or load_twin("motor_winding", overrides={"history": "2048"})
-        self.running = RunningTwin(OpenedTwin(self.twin, lambda report: self.source, store=path), door=None)
+        make = self.source if callable(self.source) else lambda report: self.source
+        self.running = RunningTwin(OpenedTwin(self.twin, make, store=path, **options), door=None)
         self.engine = self.running.engine
         self.engine.settle()
 

@@ -1,3 +1,5 @@
+"""What a twin's YAML says is in its model and its tuning; what it cannot say, and models that fail, are one line."""
+
 import os
 from pathlib import Path
 
@@ -7,6 +9,7 @@ import pytest
 from app.live.tunings.tuning_yaml import tuning_yaml
 from app.twin.twin import load_twin, restore_twin
 from config import extensions
+from config.loader import TWINS
 from estimators import errors
 from estimators.compiled.model import compile_model
 from estimators.errors import ConfigError, ModelError
@@ -247,3 +250,26 @@ def test_offsets_and_scales_are_parameters_of_the_instruments():
 
 def test_an_offset_leaves_a_linear_model_to_the_kalman_filter():
     assert twin_of(MOTOR.replace("{std: 3}", "{std: 3, offset: {std: 0.5}}")).model.linear
+
+
+JOINT = (TWINS / "motor_joint.yaml").read_text()
+
+
+def section_of(text):
+    return twin_of(f"{JOINT}\nrefit:\n{text}").config.refit
+
+
+def test_durations_and_a_lone_entry():
+    section = section_of("  entries: p.copper_resistance\n  every: 10 min\n  window: 0.5 h\n")
+    assert (section.entries, section.every, section.window) == (("p.copper_resistance",), 600.0, 1800.0)
+    assert section.adopt == "by hand"
+    section = section_of(
+        "  entries: [R, Q.winding, options.inflation]\n  every: 60\n  window: 60\n  adopt: if better\n"
+    )
+    assert section.adopt == "if better"
+
+
+@cases(__file__, "refits.csv")
+def test_what_is_refused_has_its_line(section, said):
+    text = refusal(f"{JOINT}\nrefit:\n{section}")
+    assert said in text and "motor.yaml:" in text

@@ -40,27 +40,24 @@ MADE = {
 TRUE = {"shifted": 0.6, "narrow": 1.7, "wide": 0.5, "correlated": 0.5, "alternating": -0.5}
 
 
+def covers(truth, seed, find):
+    """Whether as many intervals hold the truth as those of 95 % may."""
+    rng = np.random.default_rng(seed)
+    found = [find(rng) for _ in range(RUNS)]
+    assert all(each.low <= each.size <= each.high for each in found)
+    return 0.9 * RUNS <= sum(each.low <= truth <= each.high for each in found) <= 0.99 * RUNS
+
+
 @pytest.mark.parametrize("cause", TRUE)
 def test_intervals_cover_the_truth(cause):
     """Of 95 % intervals between 90 and 99 % hold the truth: with 400 runs a sound one leaves that once in 10⁵ times."""
-    rng = np.random.default_rng(1)
-    inside = 0
-    for _ in range(RUNS):
-        found = by_cause(MADE[cause](rng, 200))[cause]
-        assert found.low <= found.size <= found.high
-        inside += found.low <= TRUE[cause] <= found.high
     assert binom.cdf(0.9 * RUNS, RUNS, 0.95) + binom.sf(0.99 * RUNS, RUNS, 0.95) < 1e-4
-    assert 0.9 * RUNS <= inside <= 0.99 * RUNS
+    assert covers(TRUE[cause], 1, lambda rng: by_cause(MADE[cause](rng, 200))[cause])
 
 
 def test_the_mean_of_correlated_innovations_is_known_less_well():
     """A mean of AR(1) has (1 + φ) / (1 - φ) times the variance: an interval as of white noise would hold 60 %."""
-    rng = np.random.default_rng(2)
-    inside = 0
-    for _ in range(RUNS):
-        found = by_cause(0.4 + correlated(rng, 0.6, 400))["shifted"]
-        inside += found.low <= 0.4 <= found.high
-    assert 0.9 * RUNS <= inside <= 0.99 * RUNS
+    assert covers(0.4, 2, lambda rng: by_cause(0.4 + correlated(rng, 0.6, 400))["shifted"])
 
 
 def test_the_share_of_spikes_is_counted():
@@ -79,14 +76,14 @@ def test_the_share_of_spikes_is_counted():
 
 def test_the_scale_of_rows_together_covers_the_truth():
     """NIS of three rows, of which one is missing at times, all with 1.2 times the noise."""
-    rng = np.random.default_rng(10)
-    inside = 0
-    for _ in range(RUNS):
+
+    def find(rng):
         dof = rng.integers(2, 4, 100)
         found = common_scale(1.2 * np.sqrt(rng.chisquare(dof) / dof), dof)
         assert found.cause == "narrow"
-        inside += found.low <= 1.2 <= found.high
-    assert 0.9 * RUNS <= inside <= 0.99 * RUNS
+        return found
+
+    assert covers(1.2, 10, find)
 
 
 @pytest.mark.parametrize("cause", KINDS)

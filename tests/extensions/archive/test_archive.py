@@ -20,8 +20,8 @@ from app.extensions.archive.writer import archive_of
 from app.live.commands import SetTuning
 from app.twin.twin import load_twin
 from app.views.recording.rrd_file import Split, parse_split
-from app.web.running import OpenedTwin, RunningTwin
-from tests.app.scripted import Scripted, random_walk, readings
+from tests.app.live.test_store import Session as StoredSession
+from tests.app.scripted import random_walk, readings
 from tests.cases import cases
 
 OWN = ["twin", "revision", "row", "archived_ns"]
@@ -29,22 +29,16 @@ MIDNIGHT = 1_700_006_400  # s
 DAILY = parse_split("day", None)
 
 
-class Session:
+class Session(StoredSession):
     """A running twin without threads, and its archive."""
 
-    def __init__(self, folder, *, split=DAILY, twin=None, source=None, store=None):
-        self.twin = twin or load_twin("motor_winding", overrides={"history": "2048"})
-        self.source = source or Scripted(live=True)
-        make = self.source if callable(self.source) else lambda report: self.source
-        opened = OpenedTwin(self.twin, make, archive=partial(archive_of, folder / "winding", split), store=store)
-        self.running = RunningTwin(opened, door=None)
-        self.engine, self.archive = self.running.engine, self.running.archive
-        self.engine.settle()
+    def __init__(self, folder, *, split=DAILY, store=None, **options):
+        super().__init__(store, archive=partial(archive_of, folder / "winding", split), **options)
+        self.archive = self.running.archive
 
     def put(self, *batches):
         for batch in batches:
-            self.source.put(batch)
-            self.engine.settle()
+            super().put(batch)
             self.archive.look()
         return self
 

@@ -19,6 +19,8 @@ from estimators.log import READING, Events
 from estimators.track import HEALTH_NAMES, VERDICT_NAMES
 from tests.cases import cases
 
+pytestmark = pytest.mark.usefixtures("inside")
+
 FLEET = """twin: motor_winding
 source:
   type: table
@@ -49,6 +51,17 @@ def write(path, rows):
     (pyarrow.csv.write_csv if path.suffix == ".csv" else pyarrow.parquet.write_table)(table, path)
 
 
+def run(folder, rows, more=""):
+    """A fleet that has folded these rows, and what it said."""
+    write(folder / "a.csv", rows)
+    (folder / "pumps.yaml").write_text(FLEET.format(files="a.csv") + more)
+    said = []
+    running = RunningFleet(load_fleet("pumps.yaml"), lambda key, text: said.append(text), threads=1)
+    running.run()
+    running.stop()
+    return running, said
+
+
 def folded(rows, asset, until):
     """The last row of a fold over the rows of one asset, which is queried at the end if it was silent for long."""
     twin = load_twin("motor_winding")
@@ -64,8 +77,7 @@ def folded(rows, asset, until):
 
 
 @pytest.mark.parametrize("ending", ["csv", "parquet"])
-def test_each_asset_has_the_values_of_a_fold_over_its_rows(ending, tmp_path, monkeypatch, capsys):
-    monkeypatch.chdir(tmp_path)
+def test_each_asset_has_the_values_of_a_fold_over_its_rows(ending, tmp_path, capsys):
     rows = pump_rows()
     write(tmp_path / f"a.{ending}", rows[:90])
     write(tmp_path / f"b.{ending}", rows[90:])
@@ -87,8 +99,7 @@ def test_each_asset_has_the_values_of_a_fold_over_its_rows(ending, tmp_path, mon
     assert written["asset"] == list(table) and written["temperature"] == [row["temperature"] for row in table.values()]
 
 
-def test_the_worst_assets_and_the_counts_are_printed(tmp_path, monkeypatch, capsys):
-    monkeypatch.chdir(tmp_path)
+def test_the_worst_assets_and_the_counts_are_printed(tmp_path, capsys):
     write(tmp_path / "a.csv", pump_rows())
     (tmp_path / "pumps.yaml").write_text(FLEET.format(files="a.csv"))
     assert main(["fleet", "pumps.yaml", "--headless", "--worst", "2"]) == 0
@@ -102,16 +113,10 @@ def test_the_worst_assets_and_the_counts_are_printed(tmp_path, monkeypatch, caps
     ("assets", "names", "refused"),
     [("2", ["pump 0", "pump 1"], "is beyond 2"), ("[pump 4, pump 9]", ["pump 4", "pump 9"], "is not among assets")],
 )
-def test_other_assets_are_refused_and_counted(assets, names, refused, tmp_path, monkeypatch, capsys):
-    monkeypatch.chdir(tmp_path)
+def test_other_assets_are_refused_and_counted(assets, names, refused, tmp_path, capsys):
     rows = [(float(t), f"pump {k}", 40.0) for t in range(3) for k in range(5)]
-    write(tmp_path / "a.csv", rows)
-    (tmp_path / "pumps.yaml").write_text(FLEET.format(files="a.csv") + f"assets: {assets}\n")
-    said = []
-    running = RunningFleet(load_fleet("pumps.yaml"), lambda key, text: said.append(text), threads=1)
-    running.run()
+    running, said = run(tmp_path, rows, f"assets: {assets}\n")
     _, found, table = running.table()
-    running.stop()
     assert found == names and table.events.sum() == 3 * len(set(names) & {name for _, name, _ in rows})
     assert f"pumps.yaml: asset 'pump 2' {refused}; add it to assets" in said
     assert running.counts["row of no asset"] == len(said)
@@ -120,21 +125,14 @@ def test_other_assets_are_refused_and_counted(assets, names, refused, tmp_path, 
     assert told == [f"nisus: {said[0]}"]  # once, however many there are
 
 
-def test_rows_of_a_blank_name_are_of_no_asset(tmp_path, monkeypatch):
-    monkeypatch.chdir(tmp_path)
-    write(tmp_path / "a.csv", [(0.0, "pump", 40.0), (1.0, "\u200b", 40.0), (2.0, "pump", 40.0)])
-    (tmp_path / "pumps.yaml").write_text(FLEET.format(files="a.csv"))
-    said = []
-    running = RunningFleet(load_fleet("pumps.yaml"), lambda key, text: said.append(text), threads=1)
-    running.run()
+def test_rows_of_a_blank_name_are_of_no_asset(tmp_path):
+    running, said = run(tmp_path, [(0.0, "pump", 40.0), (1.0, "\u200b", 40.0), (2.0, "pump", 40.0)])
     assert running.names == ["pump"] and running.table()[2].events.sum() == 2
     assert said == ["pumps.yaml: asset '\\u200b' is blank; name it in the source"]
-    running.stop()
 
 
 @cases(__file__, "wrong_fleets.csv")
-def test_a_wrong_file_is_one_line(before, after, line, tmp_path, monkeypatch, capsys):
-    monkeypatch.chdir(tmp_path)
+def test_a_wrong_file_is_one_line(before, after, line, tmp_path, capsys):
     write(tmp_path / "a.csv", pump_rows(count=2))
     text = FLEET.format(files="a.csv")
     assert before in text
@@ -144,15 +142,13 @@ def test_a_wrong_file_is_one_line(before, after, line, tmp_path, monkeypatch, ca
     assert line in said and "\n" not in said and "pumps.yaml" in said
 
 
-def test_a_live_source_without_measurements_is_told_from_wrong_channels(tmp_path, monkeypatch, capsys):
-    monkeypatch.chdir(tmp_path)
+def test_a_live_source_without_measurements_is_told_from_wrong_channels(tmp_path, capsys):
     (tmp_path / "pumps.yaml").write_text("twin: motor_winding\nsource: {type: push}\n")
     assert main(["fleet", "pumps.yaml", "--headless", "--duration", "0.01"]) == 2
     assert capsys.readouterr().err == "nisus: pumps.yaml:2: no measurement arrived; check that its senders run\n"
 
 
-def test_open_alerts_of_a_fleet_are_kept_beside_its_store(tmp_path, monkeypatch, capsys):
-    monkeypatch.chdir(tmp_path)
+def test_open_alerts_of_a_fleet_are_kept_beside_its_store(tmp_path, capsys):
     receivers = "outputs: {receivers: {ops: {type: webhook, url: 'http://127.0.0.1:9'}}}"
     (tmp_path / "pumps.yaml").write_text(f"twin: motor_winding\nsource: {{type: push}}\n{receivers}\n")
     assert main(["fleet", "pumps.yaml", "--headless", "--duration", "0.1", "--store", "."]) == 2
@@ -160,8 +156,7 @@ def test_open_alerts_of_a_fleet_are_kept_beside_its_store(tmp_path, monkeypatch,
     capsys.readouterr()
 
 
-def test_a_broker_that_is_not_there_is_told_once(tmp_path, monkeypatch, capsys):
-    monkeypatch.chdir(tmp_path)
+def test_a_broker_that_is_not_there_is_told_once(tmp_path, capsys):
     pytest.importorskip("paho.mqtt")
     with socket.socket() as taken:  # bound and not listening: connections are refused
         taken.bind(("127.0.0.1", 0))
@@ -175,8 +170,7 @@ def test_a_broker_that_is_not_there_is_told_once(tmp_path, monkeypatch, capsys):
     assert len(told) == 1 and told[0].endswith("it is tried again")
 
 
-def test_a_tuning_that_fleets_cannot_have_names_the_twin(tmp_path, monkeypatch):
-    monkeypatch.chdir(tmp_path)
+def test_a_tuning_that_fleets_cannot_have_names_the_twin(tmp_path):
     (tmp_path / "pumps.yaml").write_text(FLEET.format(files="a.csv"))
     plan = load_fleet("pumps.yaml", {"estimator": "pf"})
     with pytest.raises(NisusError, match=r"pumps.yaml:1: twin motor_winding: fleet: estimator pf .* Gaussian filter"):
@@ -188,8 +182,7 @@ def test_a_tuning_that_fleets_cannot_have_names_the_twin(tmp_path, monkeypatch):
 
 
 @pytest.mark.parametrize("ending", ["csv", "parquet"])
-def test_the_history_of_an_asset_is_a_table_of_its_rows(ending, tmp_path, monkeypatch):
-    monkeypatch.chdir(tmp_path)
+def test_the_history_of_an_asset_is_a_table_of_its_rows(ending, tmp_path):
     rows = sorted([*pump_rows(), (1.0, "pump 30", 1.0)])
     write(tmp_path / f"a.{ending}", rows)
     (tmp_path / "pumps.yaml").write_text(FLEET.format(files=f"a.{ending}"))

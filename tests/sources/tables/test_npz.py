@@ -1,16 +1,22 @@
-"""NumPy archives as tables: what was saved is what comes out, and what cannot be is refused with its reason."""
+"""Archives of NumPy and files of MATLAB as tables: what was saved is what comes out, the same events as of a CSV.
+
+What cannot be read is refused with its reason and the file.
+"""
 
 import numpy as np
 import pytest
+from scipy.io import savemat
 
 from app.twin.twin import load_twin
 from estimators.errors import ConfigError, SourceError
-from estimators.log import READING, TRUTH
+from estimators.log import INPUT, READING, TRUTH
 from sources.source import Channel
 from sources.tables import binary
+from sources.tables.binary import read_mat
 from sources.tables.rows import format_of, read_rows
 from sources.tables.table import Table
 from sources.tables.times import TimeColumn
+from tests.sources.can.can_tools import same
 from tests.support import read_all
 
 T0 = np.datetime64("2019-03-01T00:00", "ns")
@@ -105,3 +111,69 @@ def test_a_field_takes_one_array(twin, tmp_path):
     twin.write_text(TWIN.replace("columns: t, units", 'columns: ["t[0,0]", "t[0,1]"], units'))
     with pytest.raises(ConfigError, match="temperature is a field of 90 cells; name one array of a table"):
         load_twin(twin)
+
+
+def channels(prefix=""):
+    return (
+        Channel(READING, 0, "temp", (f"{prefix}temp",), units=("degC",), model_units=("K",)),
+        Channel(INPUT, 0, "power", (f"{prefix}power",)),
+        Channel(TRUTH, 0, "x", (f"{prefix}x",)),
+    )
+
+
+def matlab(path, prefix="", time="t"):
+    return Table([path], time_column=prefix + time, time_unit="s", channels=channels(prefix), width=1)
+
+
+def columns(n, seed=0):
+    rng = np.random.default_rng(seed)
+    found = {name: rng.normal(size=n) for name in ("temp", "power", "x")}
+    found["t"] = np.arange(n) * 0.5
+    found["temp"][7 % n] = np.nan
+    return found
+
+
+def test_a_struct_gives_the_events_of_a_csv(tmp_path):
+    given = columns(9000)  # more than two chunks
+    savemat(tmp_path / "a.mat", {"meas": {name: values[:, None] for name, values in given.items()}})
+    rows = [",".join(repr(float(given[name][k])) for name in given) for k in range(9000)]
+    (tmp_path / "a.csv").write_text(",".join(given) + "\n" + "\n".join(rows) + "\n")
+    a, b = read_all(matlab(tmp_path / "a.mat", "meas.")), read_all(matlab(tmp_path / "a.csv"))
+    assert same(a, b) and len(a) == 27_000
+
+
+def test_one_of_many_structs_and_plain_vectors_of_integers(tmp_path):
+    runs = np.empty(3, object)
+    for k in range(3):
+        runs[k] = columns(5 + k, seed=k)
+    savemat(tmp_path / "b.mat", {"runs": runs, "t": np.arange(4, dtype=np.uint8), **dict.fromkeys("abc", np.ones(4))})
+    got = read_all(matlab(tmp_path / "b.mat", "runs(2)."))
+    np.testing.assert_array_equal(got.value[got.kind == INPUT, 0], columns(6, seed=1)["power"])
+    only = (Channel(TRUTH, 0, "a", ("a",)),)
+    plain = Table([tmp_path / "b.mat"], time_column="t", time_unit="s", channels=only, width=1)
+    assert read_all(plain).t.tolist() == [0, 10**9, 2 * 10**9, 3 * 10**9]
+
+
+def test_what_a_matlab_file_lacks_is_one_line(tmp_path):
+    path = tmp_path / "c.mat"
+    savemat(path, {"meas": columns(5)})
+    with pytest.raises(SourceError, match=r"c\.mat: there is no column 'meas\.time'; did you mean meas\.t"):
+        matlab(path, "meas.", "time")
+    savemat(path, {"meas": columns(5) | {"x": np.ones(4)}})
+    with pytest.raises(SourceError, match=r"meas\.x has 4 values and meas\.t has 5"):
+        read_all(matlab(path, "meas."))
+    path.write_bytes(b"MATLAB nonsense" * 20)
+    with pytest.raises(SourceError, match=r"c\.mat: it cannot be read as a MATLAB file"):
+        matlab(path, "meas.")
+    path.write_bytes(b"MATLAB 7.3 MAT-file".ljust(124) + b"\x00\x02IM" + bytes(200))
+    with pytest.raises(SourceError, match=r"c\.mat: it is MATLAB 7\.3 \(HDF5\), which is not read; save it with -v7"):
+        matlab(path, "meas.")
+
+
+@pytest.mark.parametrize("n", [5, 9000])
+def test_rows_are_counted_from_one_as_in_matlab(tmp_path, n):
+    """Complaints name a row; the last of several chunks has one number a row, as the others."""
+    savemat(tmp_path / "d.mat", {"meas": columns(n)})
+    chunks = list(read_mat(tmp_path / "d.mat", "meas.t", ["meas.x"], lambda *told: None))
+    assert np.concatenate([chunk.line for chunk in chunks]).tolist() == list(range(1, n + 1))
+    assert all(len(chunk.line) == len(chunk.values) for chunk in chunks)

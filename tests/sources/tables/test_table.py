@@ -230,21 +230,11 @@ def test_other_marks_and_files_one_after_the_other(tmp_path):
     assert got.t.tolist() == [10**9, 2 * 10**9] and got.value[:, 0].tolist() == [10.0, 20.0]
 
 
-@pytest.mark.parametrize(
-    ("name", "content", "expected"),
-    [
-        ("a.csv", b"t,temperature,b,ok,a,power,x\n", "a.csv: there is no column 'temp'; did you mean temperature?"),
-        ("b.csv", b"time,temp,a,b,ok,power,x\n", "b.csv: there is no column 't'; did you mean"),
-        ("c.csv", None, "c.csv: there is no such file; check the path of the recording"),
-        ("d.csv", b"", "d.csv: the file is empty; record it again"),
-        ("e.parquet", b"PAR1 nonsense", "e.parquet: it cannot be read as Parquet"),
-        ("f.mcap", b"\x89MCAP0", "f.mcap: needs the extension robotics, which is not there: pip install 'nisus[r"),
-    ],
-)
+@cases(__file__, "lacking.csv")
 def test_what_a_table_lacks_is_one_line(tmp_path, monkeypatch, name, content, expected):
     monkeypatch.setattr(formats, "added", lambda kind: {})
-    if content is not None:
-        (tmp_path / name).write_bytes(content)
+    if content != "absent":
+        (tmp_path / name).write_bytes(content.encode().decode("unicode_escape").encode("latin-1"))
     text = error_of(SourceError, table, tmp_path / name)
     assert text.startswith(str(tmp_path / expected))
 

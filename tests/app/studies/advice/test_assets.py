@@ -5,7 +5,6 @@ import pytest
 
 from app.studies.advice.measured import UNTOLD, Exclusion, Measured, without_faults
 from app.studies.advice.verdict import Advice, advise, changed, details, finding, lines
-from app.twin.log_reader import read_log
 from app.twin.twin import load_twin
 from config.yaml_files import rewrite
 from estimators.diagnostics.episodes import Episode
@@ -98,8 +97,8 @@ def test_what_nothing_tells_of_is_named(told):
 def test_options_of_the_twin_are_kept(tmp_path):
     """With which everything was measured; the lines took them away, and the twin was no longer consistent."""
     adaptive = "{name: kf, options: {adapt: Q, memory: 300}}"
-    twin = load_twin(path := write(tmp_path, "varying", "VARYING", adaptive, recordings.varying, "probe"))
-    found = advise(Measured(twin, read_log(twin, None)[0]))
+    twin, log = recorded(path := write(tmp_path, "varying", "VARYING", adaptive, recordings.varying, "probe"))
+    found = advise(Measured(twin, log))
     assert found.options == twin.options_of("kf") == {"adapt": 2.0, "memory": 300.0}
     rewrite(path, lambda text: changed(text, lines(found)))
     assert load_twin(path).options_of("kf") == found.options
@@ -125,9 +124,9 @@ def test_an_error_that_lasts_is_found_with_its_size_and_time(told, tmp_path):
     # The lines as they are put in make a twin that is consistent.
     path = write(tmp_path, "erring", "STILL", "kf", recordings.erring, "float")
     assert rewrite(path, lambda text: changed(text, lines(found), found.sections)) is not None
-    twin = load_twin(path)
+    twin, log = recorded(path)
     assert "float_error" in twin.model.state_names
-    again = advise(Measured(twin, read_log(twin, None)[0]))
+    again = advise(Measured(twin, log))
     assert again.claim("consistent").answer == "yes" and again.claim("lasting") is None
 
 
