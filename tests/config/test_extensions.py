@@ -9,6 +9,7 @@ from config.extensions import RESERVED, registered
 from config.model_schema import KINDS
 from config.output_schema import OutputsSection
 from tests import ROOT
+from tests.cases import cases
 from tests.support import run_python
 
 NAME = "nisus_depth"
@@ -69,18 +70,6 @@ def test_a_package_adds_a_source(tmp_path, monkeypatch):
     assert done.stdout == "[1000000000000000000] [41.5]\n"
 
 
-BROKEN = {
-    "import no_such_package": "ModuleNotFoundError: No module named 'no_such_package'",
-    "raise SystemExit(3)": "SystemExit: 3",
-    "EXTENSION = 1": "its entry point names no Extension",
-    "": "AttributeError: module 'nisus_depth' has no attribute 'EXTENSION'",
-    MODULE.replace("sources=", 'needs=("sonar",), sources='): "it needs the extension sonar",
-    MODULE.replace("sources={", "commands=None, sources={"): "its commands are no mapping from names to Part",
-    MODULE.replace("sources=", 'needs="sonar", sources='): "its needs are no tuple",
-    MODULE.replace('Literal["depth"]', 'Literal["deep"]'): "TypeError: type of DepthSection is not Literal['depth']",
-    MODULE.replace("reading: float", "reading: Unknown"): "NameError: name 'Unknown' is not defined",
-    MODULE.replace("DepthSection(MessagesSection)", "DepthSection"): "TypeError: DepthSection is no MessagesSection",
-}
 COMMANDS = """
 from app.cli.main import main
 main(['twins', 'motor_winding', '--json'])
@@ -88,9 +77,10 @@ main(['run', 'motor_winding', '--headless', '--duration', '1', '--set', 'source=
 """
 
 
-@pytest.mark.parametrize("module", BROKEN, ids=BROKEN.values())
-def test_a_broken_one_is_a_line_and_stops_only_a_twin_that_needs_it(tmp_path, monkeypatch, module):
-    text = BROKEN[module]
+@cases(__file__, "broken_extensions.csv")
+def test_a_broken_one_is_a_line_and_stops_only_a_twin_that_needs_it(tmp_path, monkeypatch, old, new, text):
+    assert old in MODULE
+    module = MODULE.replace(old, new) if old else new
     done = run(monkeypatch, installed(tmp_path, module, "depth = nisus_depth:EXTENSION"), COMMANDS)
     assert json.loads(done.stdout)["name"] == "motor_winding"
     line, told = done.stderr.splitlines()

@@ -14,13 +14,13 @@ from estimators.errors import ModelError
 from estimators.fold import Fold, fold
 from estimators.log import TICK, Events, Log
 from estimators.model.parts import correlation_of, covariance_of
-from estimators.model.state_space import Noise, Row, Sensor, State, StateSpaceModel
+from estimators.model.state_space import Row, Sensor
 from estimators.tuning import Tuning
 from sources.simulator import Simulator
 from tests.cases import cases
 from tests.estimators.linear_models import random_linear
 from tests.estimators.test_fold import in_python
-from tests.models import first_state, level_model, unchanged
+from tests.models import level_model
 from tests.support import SECOND, as_log, log_of, read_all
 
 
@@ -93,18 +93,9 @@ def thrice(x, u, p, out):
 
 def model(correlation):
     rows = tuple(Row(name, "m", variance) for name, variance in (("a", 0.5), ("b", 2.0), ("c", 1e-3)))
-    return StateSpaceModel(
-        name="three",
-        title="three rows of one state",
-        states=(State("x", "m", mean=0.0, std=1.0),),
-        noises=(Noise("x", "m²/s", 1e-3),),
-        sensors=(
-            Sensor("one", (Row("one", "m", 1.0),), h=first_state),
-            Sensor("three", rows, h=thrice, correlation=correlation),
-        ),
-        f=unchanged,
-        linear=True,
-    )
+    three = Sensor("three", rows, h=thrice, correlation=correlation)
+    one = level_model({"one": 1.0}, 1e-3, state="x", name="three", linear=True)
+    return replace(one, sensors=(*one.sensors, three))
 
 
 @pytest.fixture(scope="module")

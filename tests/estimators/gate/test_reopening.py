@@ -1,5 +1,6 @@
 """Two stories about a sensor that stays refused, and the bits that are the same in whatever pieces they are told."""
 
+from dataclasses import replace
 from itertools import product
 
 import numpy as np
@@ -10,10 +11,9 @@ from estimators.fold import Fold
 from estimators.gate.isolation import MIN_VARIANCE_SHARE, ReopeningEvidence, cost, decided, widening
 from estimators.gate.rejection_runs import MIN_RUN, RUN_PROBABILITY, rule_of
 from estimators.log import MAINTENANCE, READING, RESET, Events, Log
-from estimators.model.state_space import Noise, Row, Sensor, State, StateSpaceModel
 from estimators.track import GATED, USED
 from estimators.tuning import Tuning
-from tests.models import first_state, unchanged
+from tests.models import first_state, level_model
 from tests.support import SECOND, arrive, as_log, assert_same
 from tests.support import folded as advanced
 
@@ -216,18 +216,12 @@ def _from_east(x, u, p, out):
     out[0] = 30.0 - x[0]
 
 
-LANDMARKS = StateSpaceModel(
-    name="rail",
-    title="position between two landmarks",
-    states=(State("x", "m", mean=0.0, std=1.0),),
-    noises=(Noise("x", "m²/s", 1e-4),),
-    sensors=tuple(
-        Sensor(name, (Row(name, "m", 0.01),), h=h)
-        for name, h in (("west", _from_west), ("east", _from_east), ("fix", first_state))
-    ),
-    f=unchanged,
-    linear=True,
+RAIL = level_model(dict.fromkeys(("west", "east", "fix"), 0.01), 1e-4, state="x", name="rail", linear=True)
+LANDMARKS = replace(
+    RAIL,
+    sensors=tuple(replace(s, h=h) for s, h in zip(RAIL.sensors, (_from_west, _from_east, first_state), strict=True)),
 )
+"""A position between two landmarks."""
 
 
 def ranges(exchanged=False, jump=0.0):

@@ -1,5 +1,6 @@
 """FilterPy's filters as entries of the catalogue: ours to 1e-8 where FilterPy is right, and its faults avoided."""
 
+import json
 from dataclasses import replace
 
 import numpy as np
@@ -10,6 +11,7 @@ from estimators.log import READING, TICK, Events, Log
 from estimators.model.state_space import Input, Noise, Parameter, Row, Sensor, State, StateSpaceModel
 from estimators.track import FAILED, GATED, HELD_OUT, MISSING, USED
 from estimators.tuning import Tuning
+from tests.cases import cases
 from tests.estimators.test_fold import MODEL, everything
 from tests.models import constant_speed
 from tests.support import SECOND, as_log, assert_same, folded, log_of
@@ -107,18 +109,9 @@ def test_a_linear_model_with_gate_inputs_and_held_out_sensor(name):
     assert {USED, GATED, HELD_OUT, MISSING} <= set(theirs.verdict)
 
 
-@pytest.mark.parametrize(
-    ("name", "values"),
-    [
-        ("ekf", {}),
-        ("ukf", {}),
-        ("ukf", {"alpha": 0.5, "beta": 1.0, "kappa": 1.0}),
-        ("ukf", {"alpha": 0.1, "beta": 0.0, "kappa": 0.0}),
-        ("ukf", {"alpha": 1.2, "beta": 3.0, "kappa": -0.5}),
-    ],
-)
+@cases(__file__, "curved.csv")
 def test_a_curved_model(name, values, log):
-    tuning = Tuning.of(PENDULUM).with_options(values)
+    tuning = Tuning.of(PENDULUM).with_options(json.loads(values))
     ours, theirs = (fold(n, PENDULUM, tuning, log, pairs=PAIRS) for n in (name, f"filterpy-{name}"))
     close(theirs, ours)
 

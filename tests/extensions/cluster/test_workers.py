@@ -2,40 +2,24 @@
 
 import multiprocessing
 import os
-import signal
 import sys
 import time
 from importlib.metadata import PackageNotFoundError, version
 
-import numba
 import pytest
 
 from app.extensions.cluster import workers
 from app.studies.processes import results
 from estimators.errors import ConfigError
+from tests.app.studies.test_processes import begin, double, handled
 from tests.cases import cases
 from tests.extensions.cluster.conftest import started
 from tests.waiting import wait_for
-
-_begun: list[int] = []
-
-
-def begin(number):
-    """What a process does first."""
-    _begun.append(number)
-
-
-def double(number):
-    return 2 * number, numba.get_num_threads(), list(_begun)
 
 
 def sleep(marker):
     open(marker, "w").close()
     time.sleep(600)
-
-
-def handled():
-    return signal.SIGINT in signal.pthread_sigmask(signal.SIG_BLOCK, ())
 
 
 def die_once(marker):

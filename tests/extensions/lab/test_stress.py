@@ -38,6 +38,7 @@ from estimators.track import ADVISORY, DEGRADED, DIVERGED, SUSPECT, TRACKING, WA
 from estimators.tuning import Tuning
 from sources.faults.kinds import problem
 from tests.app.cli.test_main import documented
+from tests.app.live.runs.test_noise import WHITE_NOISE
 from tests.support import SECOND, as_log, log_of
 
 MODEL = MODELS["motor_drive"]
@@ -273,11 +274,7 @@ def test_a_wrong_belief_over_a_recording_is_foretold_by_what_follows(data):
     """Begun anew every 300 s of it: a tenth of R is found each time, a tenth of Q hardly ever."""
     data("battery_panasonic_18650pf", "25degC_US06.mat")
     # Without the errors that last, and with what was normal then.
-    overrides = {
-        "sensors.voltage": "{std: 0.06}",
-        "sensors.temperature": "{std: 0.06}",
-        "noise.temperature": "{variance: 1e-4}",
-        "source.sensors.temperature.repeats": "keep",
+    overrides = WHITE_NOISE | {
         "commissioned": """{voltage: {bias: 0.002, scale: 0.372, correlation: 0.609,
           reached: {narrow: 295.4, wide: 3524.3, shifted up: 211.4, shifted down: 229.5, correlated: 997.6,
           alternating: 522.3, spiky: 2106.5, stuck: 237.6}},

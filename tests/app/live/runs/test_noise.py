@@ -5,15 +5,17 @@ import pytest
 
 from app.cli.prepare import prepare
 from app.live.runs.sweep import doubts
-from app.twin.log_reader import read_log
-from app.twin.twin import load_twin
 from estimators.diagnostics.innovations import SensorNoise, sensor_noise
 from estimators.diagnostics.score import score
 from estimators.fold import Fold
+from tests.cases import cases
+from tests.skips import recorded
 
-WHITE = SensorNoise(0.3, 0.01, 2000, 0.01, 0.4)
-SLOW = SensorNoise(0.001, 0.0001, 2000, 0.6, 0.0)
-ALTERNATING = SensorNoise(0.5, 0.01, 2000, -0.3, 0.0)
+NOISES = {
+    "white": SensorNoise(0.3, 0.01, 2000, 0.01, 0.4),
+    "slow": SensorNoise(0.001, 0.0001, 2000, 0.6, 0.0),
+    "alternating": SensorNoise(0.5, 0.01, 2000, -0.3, 0.0),
+}
 
 
 WHITE_NOISE = {
@@ -27,9 +29,8 @@ WHITE_NOISE = {
 
 def said(name, **overrides):
     """What the innovations of a twin say of each R once it is taken, and its fits before and after."""
-    twin = load_twin(name, **overrides)
+    twin, log = recorded(name, **overrides)
     prepare(twin)
-    log, _ = read_log(twin, None)
 
     def folded(tuning):
         fold = Fold(twin.estimator, twin.model, tuning, log, policy=twin.policy)
@@ -67,22 +68,13 @@ def test_where_the_innovations_are_white_it_does_no_harm_and_is_offered():
         assert after[name].coverage == pytest.approx(before[name].coverage, abs=0.01)
 
 
-@pytest.mark.parametrize(
-    ("noise", "level", "doubted"),
-    [
-        (WHITE, 3.0, set()),
-        (WHITE, None, set()),
-        (SLOW, 3.0, {"R.y"}),  # a larger Q would mend both
-        (SLOW, 0.3, {"R.y", "Q"}),
-        (SLOW, None, {"R.y"}),
-        (ALTERNATING, 0.3, {"R.y"}),
-        (ALTERNATING, 3.0, {"R.y", "Q"}),
-    ],
-)
+@cases(__file__, "doubts.csv")
 def test_all_of_q_is_doubted_where_it_would_make_the_correlation_worse(noise, level, doubted):
-    assert set(doubts({"R.y": noise}, level)) == doubted
+    """Where innovations that are too large are alike from one to the next, a larger Q would mend both."""
+    found = doubts({"R.y": NOISES[noise]}, float(level) if level else None)
+    assert sorted(found) == sorted(doubted.split())
 
 
 def test_a_doubt_gives_the_correlation_beside_what_chance_allows():
-    text = doubts({"R.y": SLOW}, None)["R.y"]
+    text = doubts({"R.y": NOISES["slow"]}, None)["R.y"]
     assert f"+0.60 with the next, where chance allows ±{2 / np.sqrt(2000):.2f}" in text

@@ -20,6 +20,7 @@ from estimators.log import Log
 from estimators.tuning import Tuning
 from tests.app.cli.test_check import ParsedHtml
 from tests.app.scripted import MODEL, decoded, readings
+from tests.cases import cases
 
 
 @pytest.fixture(scope="module")
@@ -165,19 +166,9 @@ def test_every_cause_has_its_response(cause):
     assert len(advice(cause, "Response")) > 20 and "**" not in advice(cause, "Usual cause")
 
 
-@pytest.mark.parametrize(
-    ("twin", "labels"),
-    [
-        ("field_era5", {"t2m": "air temperature", "t2m[13,20]": "air temperature 54.75° N 5° W",
-                        "t2m[5,44]": "air temperature 56.75° N 1° E", "stations.s29_45": "stations 50.75° N 1.25° E"}),
-        ("thermal_field", {"temperature[160,100]": "temperature at 1.6 m, 1 m",
-                           "thermocouples.t50_150": "thermocouples at 0.5 m, 1.5 m"}),
-        ("battery_pack", {"soc_5": "state of charge 5", "v1_1": "polarisation voltage 1"}),
-        ("motor_bench", {}),
-    ],
-)  # fmt: skip
+@cases(__file__, "labels.csv")
 def test_labels_are_those_of_the_twin_and_positions_on_its_grid(twin, labels):
     """By hand: row 13 of a grid from 58° N southwards in steps of a quarter of a degree is 54.75° N."""
-    loaded = load_twin(twin)
+    loaded, labels = load_twin(twin), json.loads(labels)
     found = page_labels(loaded.model, loaded.config.view)
     assert {name: found.get(name) for name in labels} == labels and bool(found) == bool(labels)

@@ -27,15 +27,10 @@ def draining(x, u, p, dt, out):
     out[0] = x[0] + dt * (u[0] - 0.1 * math.sqrt(max(x[0], 0.01)))
 
 
-MILD = StateSpaceModel(
-    name="mild",
-    title="A tank that drains",
-    states=(State("level", "m", mean=1.0, std=0.05),),
-    inputs=(Input("inflow", "m/s", 0.1),),
-    noises=(Noise("level", "m²/s", 1e-5),),
-    sensors=(Sensor("gauge", (Row("gauge", "m", 1e-4),), h=first_state),),
-    f=draining,
-)
+MILD = level_model(
+    {"gauge": 1e-4}, 1e-5, name="mild", title="A tank that drains", mean=1.0, std=0.05,
+    inputs=(Input("inflow", "m/s", 0.1),), f=draining,
+)  # fmt: skip
 
 
 def reverting(x, u, p, dt, out):

@@ -6,25 +6,17 @@ import pytest
 from app.views.viser.guarded_server import HEADER
 from app.views.viser.scene import place
 from app.views.viser.view import ViserView
-from estimators.log import READING, TRUTH, Events
-from estimators.models import MODELS
-from tests.app.scripted import events, viewed
+from tests.app.scripted import viewed
+from tests.app.views.viser.test_view import WINDING, history
 from tests.waiting import wait_for
 
 pytestmark = pytest.mark.browser
-
-WINDING = MODELS["motor_winding"]
 
 
 @pytest.fixture
 def engine():
     engine = viewed(WINDING)
-    rng = np.random.default_rng(3)
-    t = 1.0 + np.arange(60)
-    truth = 40.0 + 0.1 * t
-    parts = [events(WINDING, READING, 0, t, truth + rng.normal(0, 2, 60)), events(WINDING, TRUTH, 0, t, truth)]
-    both = Events.concat(parts, WINDING.width)
-    engine.put(both.select(np.argsort(both.t, kind="stable")))
+    engine.put(history(seed=3))
     return engine
 
 
