@@ -8,7 +8,7 @@ from estimators.log import INPUT, READING, TICK, TRUTH, truth_of
 from estimators.model.state_space import Input, Jump, Noise, Parameter, Row, Sensor, State, StateSpaceModel
 from estimators.models import MODELS
 from sources.simulator import SensorPlan, Simulator, constant_input, factor, sine_input, stepped_input, summed_inputs
-from tests.models import first_state, second_state
+from tests.models import level_model, second_state
 from tests.sources.can.can_tools import same
 from tests.support import read_all
 
@@ -282,10 +282,7 @@ def raises_above_one(x, u, p, dt, out):
 
 
 def test_a_model_that_raises_on_the_way_is_one_line():
-    model = StateSpaceModel(
-        name="rising", title="rising", states=(State("a", "m"),), noises=(Noise("a", "m²/s", 0.0),),
-        f=raises_above_one, sensors=(Sensor("s", (Row("a", "m", 1.0),), first_state),),
-    )  # fmt: skip
+    model = level_model({"s": 1.0}, 0.0, name="rising", f=raises_above_one)
     source = Simulator(model, seed=1, step=0.5, duration=10.0)
     with pytest.raises(
         SourceError, match=r"model rising fails at 2 s: ValueError: too high; it may not fail at states"

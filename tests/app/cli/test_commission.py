@@ -129,9 +129,7 @@ def test_a_wrong_section_is_one_line(tmp_path, section, said):
 
 def test_a_twin_is_commissioned_against_white_innovations_whatever_was_normal_before(tmp_path):
     """Readings twenty times as noisy as R says are no longer diverged once that was normal; they are if told anew."""
-    path = drive(tmp_path, TWIN + "commissioned:\n  winding: {scale: 50}\n")
-    y = 40.0 + np.random.default_rng(1).normal(0.0, 40.0, 300)
-    (tmp_path / "drive.csv").write_text("t,y\n" + "".join(f"{k},{value:.3f}\n" for k, value in enumerate(y)))
+    path = drive(tmp_path, TWIN + "commissioned:\n  winding: {scale: 50}\n", noise=40.0)
     twin, log = recorded(path)
 
     def lost(tuning):

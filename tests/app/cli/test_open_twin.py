@@ -1,5 +1,6 @@
 """How `run` and `review` open a twin: its speed, the gallery, and a review with the verdicts and notes of a run."""
 
+import json
 import subprocess
 import sys
 
@@ -8,7 +9,7 @@ import pytest
 
 from app.cli.open_twin import opened_review, opened_twin, recorded_twin
 from app.live.notices import Annotation
-from app.twin.log_reader import read_log, remarking
+from app.twin.log_reader import remarking
 from app.twin.twin import load_twin
 from app.views.recording.reader import read_recording
 from app.views.recording.writer import write_recording
@@ -18,6 +19,8 @@ from estimators.diagnostics.episodes import episodes
 from estimators.errors import ConfigError, SourceError
 from sources.source import LOST_FRAMES, controls_of
 from tests import ROOT
+from tests.cases import cases
+from tests.skips import recorded
 from tests.support import SECOND, assert_same, folded
 from tests.waiting import wait_for
 
@@ -76,26 +79,19 @@ def judged(twin, log, base=None):
     return fold.track, episodes(fold)
 
 
-@pytest.mark.parametrize(
-    "overrides",
-    [
-        {},
-        {"sensors.winding.range": "[-40, 55]"},
-        {"prior.temperature.mean": "90", "Q.rate": "0.01", "commissioned": "{}"},
-    ],
-)
+@cases(__file__, "reviewed.csv")
 def test_a_review_judges_as_the_run_did(overrides, tmp_path):
     yaml = tmp_path / "motor.yaml"
     yaml.write_text(COMMISSIONED)
-    twin = load_twin(yaml, overrides=overrides)
-    log, _ = read_log(twin, None)
+    overrides = json.loads(overrides)
+    twin, log = recorded(yaml, overrides=overrides)
     track, told = judged(twin, log)
     write_recording(tmp_path / "run.rrd", twin, log, track)
-    recorded = read_recording(tmp_path / "run.rrd")
-    again = recorded_twin(recorded)
+    kept = read_recording(tmp_path / "run.rrd")
+    again = recorded_twin(kept)
     assert told
-    assert judged(again, log, recorded.base)[1] == told
-    assert_same(judged(again, log, recorded.base)[0], track)
+    assert judged(again, log, kept.base)[1] == told
+    assert_same(judged(again, log, kept.base)[0], track)
     # And what is compared does depend on what was left out before.
     if overrides or twin.tuning.baseline is not None:
         bare = load_twin(yaml, overrides={"commissioned": "{}"} if not overrides else {})

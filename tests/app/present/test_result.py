@@ -7,7 +7,7 @@ from typing import NamedTuple
 import numpy as np
 import pytest
 
-from app.format_time import format_time
+from app.format_time import counted, format_time
 from app.present.result import (
     MAX_TABLE_WIDTH,
     WIDTH,
@@ -97,3 +97,10 @@ def test_json_has_objects_for_named_tuples_and_null_for_what_is_no_number():
 )
 def test_a_time_has_a_date_where_its_clock_counts_from_1970(t, said):
     assert format_time(t) == said
+
+
+@pytest.mark.parametrize(
+    "number, text", [(0, "0 readings"), (1, "1 reading"), (2, "2 readings"), (1200, "1,200 readings")]
+)
+def test_a_count_has_the_number_of_its_noun(number, text):
+    assert counted(number, "reading") == text

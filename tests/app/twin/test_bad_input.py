@@ -23,6 +23,7 @@ from estimators.tuning import Tuning
 from tests import ROOT
 from tests.app.scripted import Replayed, Stepped, pull_all
 from tests.cases import cases
+from tests.models import first_state, unchanged
 from tests.support import SECOND, error_of
 
 PATH = ROOT / "config" / "twins" / "motor_winding.yaml"
@@ -106,22 +107,15 @@ def test_a_choice_may_be_given_as_its_word():
 
 
 def test_a_covariance_that_is_none_is_refused_when_the_model_loads():
-    def f(x, u, p, dt, out):
-        out[0] = x[0]
-        out[1] = x[1]
-
     def Q(x, u, p, q, dt, out):
         out[0, 0] = q[0] * dt
         out[1, 1] = q[0] * dt
         out[0, 1] = 2.0 * q[0] * dt
         out[1, 0] = 2.0 * q[0] * dt
 
-    def h(x, u, p, out):
-        out[0] = x[0]
-
     model = StateSpaceModel(
-        name="crossed", title="Crossed", f=f, Q=Q, states=(State("a", "m", 0, 1), State("b", "m", 0, 1)),
-        noises=(Noise("a", "m²/s", 0.5),), sensors=(Sensor("a", (Row("a", "m", 1.0),), h),),
+        name="crossed", title="Crossed", f=unchanged, Q=Q, states=(State("a", "m", 0, 1), State("b", "m", 0, 1)),
+        noises=(Noise("a", "m²/s", 0.5),), sensors=(Sensor("a", (Row("a", "m", 1.0),), first_state),),
     )  # fmt: skip
     with pytest.raises(
         ModelError, match=r"Q is not positive semidefinite \(it has the eigenvalue -0.5\) at the prior; a cov"

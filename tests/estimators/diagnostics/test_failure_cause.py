@@ -14,15 +14,12 @@ from estimators.model.state_space import Input, Noise, Parameter, Row, Sensor, S
 from estimators.track import FAILED
 from estimators.tuning import Tuning
 from tests.estimators.ensemble.blocks import BOX, both_block, f_block
+from tests.models import first_state
 from tests.support import folded, log_of
 
 
 def drift(x, u, p, dt, out):
     out[0] = x[0] + u[0] * dt
-
-
-def plain(x, u, p, out):
-    out[0] = x[0]
 
 
 def shrinking(x, u, p, q, dt, out):
@@ -45,7 +42,7 @@ def root(x, u, p, out):
 def walk(**changes):
     parts = dict(
         name="walk", title="", states=(State("s", "m", 0.0, 0.1),), noises=(Noise("s", "m²/s", 4.0),), f=drift,
-        inputs=(Input("speed", "m/s", 0.0),), sensors=(Sensor("gauge", (Row("s", "m", 0.01),), h=plain),),
+        inputs=(Input("speed", "m/s", 0.0),), sensors=(Sensor("gauge", (Row("s", "m", 0.01),), h=first_state),),
     )  # fmt: skip
     return StateSpaceModel(**(parts | changes))
 

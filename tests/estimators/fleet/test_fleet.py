@@ -84,20 +84,12 @@ def add(target, event, *asset):
         target.add(what, *asset, t, values)
 
 
-@pytest.mark.parametrize(
-    ("estimator", "name", "gate"),
-    [
-        ("kf", "motor_winding", None),
-        ("ekf", "motor_drive", "hard"),
-        ("ukf", "motor_winding", "soft"),
-        ("sr-kf", "motor_winding", "hard"),
-    ],
-)
+@cases(__file__, "gated_fleets.csv")
 @pytest.mark.parametrize("threads", [1, 3])
 def test_fleet_of_random_assets_has_the_bits_of_single_folds(estimator, name, gate, threads):
     model = MODELS[name]
     rng = np.random.default_rng(7 + threads)
-    tunings = [Tuning.of(model) if gate is None else gated(model, gate_kind=gate)] * 12
+    tunings = [gated(model, gate_kind=gate) if gate else Tuning.of(model)] * 12
     tunings[5] = replace(tunings[0], r=tunings[0].r * 2.0)
     baseline = no_baseline(model)
     baseline[:, :3] = 0.3, 1.2, 0.2  # bias, scale and correlation: sums of the expected NIS have rounding

@@ -15,7 +15,7 @@ from estimators.model.state_space import Noise, Row, Sensor, State, StateSpaceMo
 from estimators.models import MODELS
 from estimators.models.motor_drive import COPPER, MOTOR_DRIVE
 from estimators.models.road_car import ROAD_CAR
-from tests.models import complex_step, first_state
+from tests.models import complex_step, first_state, unchanged
 from tests.skips import recorded
 
 P = {item.name: k for k, item in enumerate(MOTOR_DRIVE.parameters)}
@@ -300,12 +300,9 @@ def test_drive_s_own_jacobian_is_the_complex_step_of_its_step():
 def test_an_angle_read_by_a_row_that_does_not_wrap_is_refused(reads, row_circular, fine):
     """What a full turn changes, no filter can compare: the state is within ±π whenever h sees it."""
 
-    def f(x, u, p, dt, out):
-        out[0] = x[0]
-
     h = {"angle": first_state, "sine": sine_of_angle, "twice": twice_the_angle, "half": half_the_angle}[reads]
     model = StateSpaceModel(
-        name="vane", title="", f=f, states=(State("angle", "rad", 0.0, 0.5, circular=True),),
+        name="vane", title="", f=unchanged, states=(State("angle", "rad", 0.0, 0.5, circular=True),),
         noises=(Noise("angle", "rad²/s", 0.1),),
         sensors=(Sensor("y", (Row("y", "rad", 0.1, circular=row_circular),), h),),
     )  # fmt: skip

@@ -42,11 +42,8 @@ def corrected(text, **options):
 
 def test_what_it_says_is_in_the_model():
     model = corrected(RIGHT).model
-    assert [(item.name, item.unit, item.variance) for item in model.noises][-1] == (
-        "temperature_learned",
-        "°C²/s",
-        0.25,
-    )
+    noise = model.noises[-1]
+    assert (noise.name, noise.unit, noise.variance) == ("temperature_learned", "°C²/s", 0.25)
     # The same content is the same object, and what was compiled of it.
     assert corrected(RIGHT).model.f is model.f
     assert corrected(RIGHT.replace("0.2", "0.3")).model.f is not model.f

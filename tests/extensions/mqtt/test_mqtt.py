@@ -17,6 +17,7 @@ from sources.messages import Messages
 from sources.source import Channel, ignore
 from tests.app.outputs.pushed import BEGIN, push, pushed_twin
 from tests.app.scripted import notice_texts
+from tests.cases import cases
 from tests.extensions.mqtt.broker import Listener
 from tests.support import SECOND, free_port
 from tests.waiting import wait_for
@@ -189,17 +190,10 @@ def test_a_source_whose_broker_comes_back_goes_on(serve, broker):
     listener.stop()
 
 
-@pytest.mark.parametrize(
-    ("value", "unit", "ns"),
-    [
-        (1767225600.25, "s", BEGIN + SECOND // 4),
-        (1767225600123, "ms", BEGIN + 123_000_000),
-        (BEGIN + 7, "ns", BEGIN + 7),
-    ],
-)
+@cases(__file__, "times.csv")
 def test_times_in_numbers_are_exact(value, unit, ns):
     topic = TopicMap(values={"a": "v"}, time="t", unit=unit)
-    assert topic.message("x", json.dumps({"v": 1, "t": value}).encode())["time"] == ns
+    assert topic.message("x", f'{{"v": 1, "t": {value}}}'.encode())["time"] == int(ns)
     assert TopicMap(values={"a": ""}).message("x", b"No Data")["values"] == {"a": "No Data"}
 
 

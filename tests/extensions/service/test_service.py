@@ -1,4 +1,4 @@
-"""A service of several twins: one page each, processes of their own, and an overview."""
+"""A service of several twins: one page each, processes of their own with what they need loaded, and an overview."""
 
 import http.client
 import io
@@ -20,6 +20,7 @@ from websockets.sync.client import connect
 from app.cli.main import main
 from tests import ROOT
 from tests.cases import cases
+from tests.support import run_python
 from tests.waiting import LIMIT_S, wait_for
 
 TOKENS = {"ann": ("view", "a" * 20), "bob": ("tune", "b" * 20), "plc": ("feed", "c" * 20), "eve": ("admin", "e" * 20)}
@@ -285,3 +286,28 @@ def test_a_service_that_cannot_be_is_one_line(capsys, arguments, line, tmp_path,
     (tmp_path / " .yaml").write_text("model: motor_winding\n")
     assert main(["serve", *shlex.split(arguments)]) == 2
     assert line in capsys.readouterr().err
+
+
+PROGRAM = """
+import json, sys
+from app.extensions.service import preloaded
+from config.schema import TwinSection
+complete, before = TwinSection.__pydantic_complete__, {*sys.modules}
+from pathlib import Path
+from app.cli.open_twin import FileOpener, open_session, opened_twin
+from app.web.gallery.gallery import StartRequest
+from app.web.session import Page
+opener = FileOpener()
+opening = opener.made_ready(opened_twin("motor_winding"))
+session = open_session(opening, StartRequest("motor_winding"), opener, page=Page(0, False, overview="../../"),
+                       recordings=Path(sys.argv[1]))
+session.start()
+print(json.dumps([complete, sorted({*sys.modules} - before)]))
+session.stop()
+"""
+
+
+def test_a_twin_opens_without_further_libraries(tmp_path):
+    complete, loaded = json.loads(run_python(PROGRAM, tmp_path, timeout=LIMIT_S).stdout.splitlines()[-1])
+    assert complete
+    assert [name for name in loaded if name.split(".")[0] in ("PIL", "app", "config", "imageio")] == []
