@@ -3,6 +3,7 @@
 from config.extensions import extensions
 from tests import ROOT
 from tests.imports import PACKAGES, edges, imported, modules
+from tests.without import problems, with_dependents
 
 MAY_IMPORT = {
     "estimators": ("estimators",),
@@ -86,6 +87,11 @@ def test_tests_of_the_core_need_no_extension():
     core = tuple(f"tests.{package}." for package in PACKAGES)
     found = edges(*PACKAGES, "tests").items()
     assert {name for name, to in found if name.startswith(core) and any(map(extension, to))} == set()
+
+
+def test_the_core_works_without_any_extension():
+    assert with_dependents(["mqtt"]) == {"mqtt", "fleet"}
+    assert problems({*extensions()}) == []
 
 
 def test_no_module_imports_in_a_circle():

@@ -3,10 +3,18 @@
 import shutil
 import subprocess
 import sys
+from pathlib import Path
 from zipfile import ZipFile
 
 from tests import ROOT
 from tests.imports import PACKAGES
+
+
+def wheel_of(folder: Path, into: Path) -> Path:
+    """Build the wheel of a project, as pip does, and return its file."""
+    build = f"from setuptools import build_meta; build_meta.build_wheel({str(into)!r})"
+    subprocess.run([sys.executable, "-c", build], cwd=folder, capture_output=True, check=True)
+    return next(into.glob("*.whl"))
 
 
 def test_the_wheel_has_all_files_of_the_packages(tmp_path):
@@ -18,9 +26,7 @@ def test_the_wheel_has_all_files_of_the_packages(tmp_path):
     for name in names:
         (copy / name).parent.mkdir(parents=True, exist_ok=True)
         shutil.copy(ROOT / name, copy / name)
-    build = f"from setuptools import build_meta; build_meta.build_wheel({str(tmp_path)!r})"
-    subprocess.run([sys.executable, "-c", build], cwd=copy, capture_output=True, check=True)
-    with ZipFile(next(tmp_path.glob("*.whl"))) as file:
+    with ZipFile(wheel_of(copy, tmp_path)) as file:
         packed = set(file.namelist())
     wanted = {name for name in names if name.startswith(tuple(f"{package}/" for package in PACKAGES))}
     assert {f"{package}/py.typed" for package in PACKAGES} <= wanted

@@ -6,7 +6,6 @@ damaged, of which each is one line, and without these.
 
 from __future__ import annotations
 
-import argparse
 import os
 import shutil
 import subprocess
@@ -21,7 +20,7 @@ from tests import ROOT
 
 FOLDERS = ("app", "config", "estimators", "sources", "tests", "docs/examples")
 QUICK = ("tests/config", "tests/app/twin/test_source.py", "tests/app/present/test_result.py")
-"""Tests of the core that take seconds; `--tests` names others."""
+"""Tests of the core that take seconds."""
 
 COMMANDS = (
     "run motor_winding --headless --duration 5 --record drive.rrd",
@@ -74,7 +73,7 @@ def tried(copy: Path, command: list[str], told: set[str]) -> str:
     return "" if sorted(lines) == sorted(told) else f"{' '.join(command)}: tells of {lines}, not of {sorted(told)}"
 
 
-def problems(names: set[str], tests: Iterable[str] = QUICK) -> list[str]:
+def problems(names: set[str]) -> list[str]:
     """Return what does not work without these extensions."""
     found = []
     for registered in (True, False):
@@ -82,25 +81,13 @@ def problems(names: set[str], tests: Iterable[str] = QUICK) -> list[str]:
             copy = copied(Path(folder), names, registered=registered)
             told = names if registered else set()
             found += [tried(copy, ["app.cli.main", *words.split()], told) for words in COMMANDS]
-            if tests and not registered:
-                found.append(tried(copy, ["pytest", "-q", "-x", "-p", "no:cacheprovider", *tests], set()))
+            if not registered:
+                found.append(tried(copy, ["pytest", "-q", "-x", "-p", "no:cacheprovider", *QUICK], set()))
     return [text for text in found if text]
 
 
-def main() -> int:
-    """Try each of the named extensions, or of all, and all of them at once."""
-    parser = argparse.ArgumentParser(prog="python -m tests.without", description=__doc__)
-    parser.add_argument("names", nargs="*", help="extensions to leave out together; default: each alone, then all")
-    parser.add_argument("--tests", nargs="*", default=QUICK, help="tests of the core to run")
-    given = parser.parse_args()
-    cases = [set(given.names)] if given.names else [*({name} for name in extensions()), {*extensions()}]
-    failed = 0
-    for names in map(with_dependents, cases):
-        found = problems(names, given.tests)
-        print(f"without {', '.join(sorted(names))}: {'; '.join(found) or 'works'}", flush=True)
-        failed |= bool(found)
-    return failed
-
-
 if __name__ == "__main__":
-    sys.exit(main())
+    cases = [set(sys.argv[1:])] if sys.argv[1:] else [*({name} for name in extensions()), {*extensions()}]
+    told = [(names, problems(names)) for names in map(with_dependents, cases)]
+    print("\n".join(f"without {', '.join(sorted(names))}: {'; '.join(wrong) or 'works'}" for names, wrong in told))
+    sys.exit(any(wrong for _, wrong in told))

@@ -47,7 +47,7 @@ _shared: dict[str, Any] = {}
 def tasks() -> Iterator[BenchmarkRow]:
     """A task without work, in processes and on a Dask cluster on this machine: ms by the clock."""
     for name, way in WAYS.items():
-        took = [_spent(_nothing, [()] * count, way)[0] for count in (FEW, MANY)]
+        took = [_spent(int, [()] * count, way)[0] for count in (FEW, MANY)]
         yield BenchmarkRow(name, {"per task [ms]": 1e3 * (took[1] - took[0]) / (MANY - FEW), "start [s]": took[0]})
 
 
@@ -103,10 +103,6 @@ def _spent(work: Any, calls: list[tuple[Any, ...]], way: dict[str, Any], **more:
     ended = perf_counter()
     # The first result comes when each worker has begun another call.
     return ended - begun, (ended - first) * len(calls) / (len(calls) - 1), [found[k] for k in sorted(found)]
-
-
-def _nothing() -> None:
-    pass
 
 
 def _share() -> None:

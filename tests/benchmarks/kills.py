@@ -32,8 +32,7 @@ import pyarrow.parquet
 from app.extensions.fleet.plan import load_fleet
 from app.extensions.fleet.running import RunningFleet
 from app.extensions.fleet.table import arrow_table, in_name_order
-from app.extensions.mqtt.client import mqtt_client
-from app.extensions.mqtt.source import MqttSource, TopicMap
+from app.extensions.mqtt.source import MqttSource, TopicMap, mqtt_client
 from app.live.store import Store, read_store
 from app.terminal import EndRequest, when_asked_to_end
 from app.twin.twin import Twin, load_twin

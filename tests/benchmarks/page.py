@@ -35,8 +35,7 @@ from app.views.recording.reader import read_recording
 from estimators.errors import SourceError
 from estimators.log import READING
 from tests.chromium import find_chromium, launched
-from tests.extensions.fleet.test_command import FLEET, pump_rows
-from tests.extensions.fleet.test_command import write as write_table
+from tests.extensions.fleet.test_command import FLEET, pump_rows, write
 
 from .timing import BenchmarkRow, Bound, Section, run_sections
 
@@ -166,7 +165,7 @@ def asset() -> Iterator[BenchmarkRow]:
     took = []
     with tempfile.TemporaryDirectory() as folder:
         rows = pump_rows(assets=ASSETS, count=ROWS)
-        write_table(Path(folder) / "pumps.csv", rows)
+        write(Path(folder) / "pumps.csv", rows)
         times: dict[str, list[float]] = {}
         for t, name, _ in rows:
             times.setdefault(name, []).append(t)

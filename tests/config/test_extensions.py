@@ -2,8 +2,6 @@
 
 import json
 
-import pytest
-
 from app.twin.source import SOURCES
 from config.extensions import RESERVED, registered
 from config.model_schema import KINDS
@@ -14,7 +12,7 @@ from tests.support import run_python
 
 NAME = "nisus_depth"
 
-MODULE = '''
+MODULE = """
 from typing import Literal
 
 from config.channels import MessagesSection
@@ -22,12 +20,8 @@ from config.extensions import Extension, Part
 
 
 class DepthSection(MessagesSection):
-    """A depth gauge that always reads the same."""
-
     type: Literal["depth"]
-    """depth"""
     reading: float
-    """What it reads."""
 
 
 def open_depth(opening):
@@ -39,7 +33,7 @@ def open_depth(opening):
 
 
 EXTENSION = Extension(sources={"depth": Part("nisus_depth:DepthSection", "nisus_depth:open_depth")})
-'''
+"""
 
 OPENED = """
 import sys
@@ -88,19 +82,12 @@ def test_a_broken_one_is_a_line_and_stops_only_a_twin_that_needs_it(tmp_path, mo
     assert "is 'depth'" in told and told.endswith(f"; extensions that cannot be loaded: depth ({text})")
 
 
-MADE = {
-    "opened": "AttributeError: module 'nisus_depth' has no attribute 'opened'; install its package again",
-    "broken": "depth of its sources: ZeroDivisionError: division by zero",
-    "nothing": "depth of its sources: its function returns nothing",
-}
-
-
-@pytest.mark.parametrize("name", MADE)
-def test_a_function_that_fails_is_one_line_for_the_twin_that_asks_for_it(tmp_path, monkeypatch, name):
+@cases(__file__, "failing_functions.csv")
+def test_a_function_that_fails_is_one_line_for_the_twin_that_asks_for_it(tmp_path, monkeypatch, name, text):
     module = MODULE.replace("nisus_depth:open_depth", f"nisus_depth:{name}")
     module += "\nnothing = lambda opening: None\nbroken = lambda opening: 1 / 0\n"
     done = run(monkeypatch, installed(tmp_path, module, "depth = nisus_depth:EXTENSION"), COMMANDS)
-    assert done.stderr == f"nisus: extension depth: {MADE[name]}\n"
+    assert done.stderr == f"nisus: extension depth: {text}\n"
 
 
 def test_names_of_the_core_are_reserved():

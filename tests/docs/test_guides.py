@@ -24,6 +24,7 @@ from tests import ROOT
 from tests.app.conftest import browser, shared_chromium
 from tests.app.web.page.conftest import visit
 from tests.support import free_port
+from tests.test_package import wheel_of
 from tests.waiting import LIMIT_S, wait_for
 
 GUIDES = sorted([*ROOT.glob("*.md"), *(ROOT / "docs").glob("*.md")])
@@ -143,21 +144,11 @@ EXAMPLE = ROOT / "docs" / "examples" / "nisus_udp"
 AT = 1_760_000_000  # s since 1970
 
 
-@pytest.fixture
-def site(tmp_path):
-    """The folder of packages in which the example is installed, from its wheel."""
-    copy, built, into = tmp_path / "copy", tmp_path / "built", tmp_path / "site"
-    shutil.copytree(EXAMPLE, copy, ignore=shutil.ignore_patterns("__pycache__"))
-    built.mkdir()
-    build = f"from setuptools import build_meta; build_meta.build_wheel({str(built)!r})"
-    subprocess.run([sys.executable, "-c", build], cwd=copy, capture_output=True, check=True)
-    with ZipFile(next(built.glob("*.whl"))) as wheel:
-        wheel.extractall(into)
-    return into
-
-
 @pytest.mark.browser
-def test_the_example_takes_datagrams_sends_the_state_and_shows_it(site, visit, tmp_path):
+def test_the_example_takes_datagrams_sends_the_state_and_shows_it(visit, tmp_path):
+    copy = shutil.copytree(EXAMPLE, tmp_path / "copy", ignore=shutil.ignore_patterns("__pycache__"))
+    with ZipFile(wheel_of(copy, tmp_path)) as wheel:
+        wheel.extractall(site := tmp_path / "site")
     receiver, port = socket.socket(type=socket.SOCK_DGRAM), free_port(socket.SOCK_DGRAM)
     receiver.bind(("127.0.0.1", 0))
     receiver.settimeout(LIMIT_S)
