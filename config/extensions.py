@@ -206,8 +206,12 @@ def maker(kind: Kind, key: str, asked: str = "", extra: str = "") -> Callable[..
 
 def made(kind: Kind, *given: Any) -> list[Any]:
     """Return what the functions of all parts of a kind make; what fails is reported, and left out."""
-    parts = ((name, key) for key, (name, _) in registered(kind).items())
-    return [found for name, key in parts if (found := _tried(name, lambda key=key: maker(kind, key)(*given)))]
+
+    def one(key: str) -> Any:
+        return maker(kind, key)(*given)
+
+    parts = registered(kind).items()
+    return [found for key, (name, _) in parts if (found := _tried(name, partial(one, key))) is not None]
 
 
 def _tried(name: str, work: Callable[[], T]) -> T | None:

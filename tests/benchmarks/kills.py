@@ -290,7 +290,7 @@ def survive_fleet(
     fleet = {"twin": "motor_winding", "source": source}
     (folder / "pumps.yaml").write_text(json.dumps(fleet))
     process, rng = FleetProcess(folder, expected), np.random.default_rng(seed)
-    publisher = mqtt_client(SimpleNamespace(user=None, ca_file=None), None, client_id="")
+    publisher = mqtt_client(SimpleNamespace(user=None, ca_file=None), None, client_id="")  # type: ignore[arg-type]
     publisher.max_queued_messages_set(0)
     publisher.connect("127.0.0.1", broker.port)
     publisher.loop_start()
