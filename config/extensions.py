@@ -15,13 +15,10 @@ import pkgutil
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from functools import cache, partial
-from importlib.metadata import entry_points
+from importlib.metadata import EntryPoint, entry_points
 from typing import Any, Literal, NamedTuple, TypeVar, get_args
 
 from estimators.errors import ConfigError, NisusError, printable, reason_of
-
-from .channels import MessagesSection
-from .fields import Section
 
 GROUP = "nisus.extensions"
 T = TypeVar("T")
@@ -112,27 +109,25 @@ def left_out() -> str:
 def extensions() -> dict[str, Extension]:
     """Return the installed extensions, by name. One that cannot be loaded is reported in a line, and left out."""
     points = sorted(entry_points(group=GROUP), key=lambda point: point.name)
-    found = {point.name: item for point in points if (item := _tried(point.name, point.load)) is not None}
-    for name, item in list(found.items()):
-        if misfit := _misfit(item):
-            _leave_out(found, name, misfit)
+    found = {point.name: item for point in points if (item := _tried(point.name, partial(_loaded, point))) is not None}
     while lacking := {name: need for name, item in found.items() for need in item.needs if need not in found}:
         for name, need in lacking.items():
-            _leave_out(found, name, f"it needs the extension {need}")
+            del found[name]
+            _leave_out(name, f"it needs the extension {need}")
     return found
 
 
-def _misfit(item: Any) -> str:
-    """Return why an object is no extension; nothing if it is one."""
+def _loaded(point: EntryPoint) -> Extension:
+    item = point.load()
     if not isinstance(item, Extension):
-        return "its entry point names no Extension"
+        raise ConfigError("its entry point names no Extension")
     if not isinstance(item.needs, tuple):
-        return "its needs are no tuple"
+        raise ConfigError("its needs are no tuple")
     for kind in get_args(Kind):
         own = getattr(item, kind)
         if not isinstance(own, Mapping) or not all(isinstance(part, Part) for part in own.values()):
-            return f"its {kind} are no mapping from names to Part"
-    return ""
+            raise ConfigError(f"its {kind} are no mapping from names to Part")
+    return item
 
 
 @cache
@@ -141,8 +136,7 @@ def registered(kind: Kind) -> dict[str, tuple[str, Part]]:
     found: dict[str, tuple[str, Part]] = {}
     for name, item in extensions().items():
         for key, part in getattr(item, kind).items():
-            taken = key in RESERVED.get(kind, ()) or (kind == "outputs" and (key[:1] == "_" or hasattr(Section, key)))
-            if taken or found.setdefault(key, (name, part)) != (name, part):
+            if key in RESERVED.get(kind, ()) or found.setdefault(key, (name, part)) != (name, part):
                 _report(f"extension {name}: {key} of its {kind} is left out, as there is one of that name")
     return found
 
@@ -162,9 +156,14 @@ def _usable(reference: str, kind: Kind, key: str) -> Any:
     """Return a class of options or sections; one that would stop every twin is refused."""
     schema = pkgutil.resolve_name(reference)
     if kind != "commands":
+        from .channels import MessagesSection  # here, as commands without a YAML do not wait for pydantic
+        from .fields import Section
+
         base = MessagesSection if kind == "sources" else Section
         if not issubclass(schema, base):
             raise TypeError(f"{schema.__name__} is no {base.__name__}")
+        if kind == "outputs" and (key[:1] == "_" or hasattr(base, key)):
+            raise TypeError(f"{key} is a name of pydantic")
         schema.model_rebuild()
         if kind in TAGGED and get_args(schema.model_fields["type"].annotation) != (key,):
             raise TypeError(f"type of {schema.__name__} is not Literal[{key!r}]")
@@ -210,15 +209,15 @@ def made(kind: Kind, *given: Any) -> list[Any]:
     def one(key: str) -> Any:
         return maker(kind, key)(*given)
 
-    parts = registered(kind).items()
-    return [found for key, (name, _) in parts if (found := _tried(name, partial(one, key))) is not None]
+    tried = (_tried(name, partial(one, key)) for key, (name, _) in registered(kind).items())
+    return [found for found in tried if found is not None]
 
 
 def _tried(name: str, work: Callable[[], T]) -> T | None:
     try:
         return work()
     except (Exception, SystemExit) as error:  # noqa: BLE001  no extension may stop a twin that does not need it
-        _leave_out({}, name, _gist(error))
+        _leave_out(name, _gist(error))
         return None
 
 
@@ -226,8 +225,7 @@ def _gist(error: BaseException) -> str:
     return printable(reason_of(error).partition("\n")[0].removesuffix(": "))
 
 
-def _leave_out(found: dict[str, Any], name: str, why: str) -> None:
-    found.pop(name, None)
+def _leave_out(name: str, why: str) -> None:
     if name not in _left_out:
         _left_out[name] = why
         _report(f"extension {name} is left out: {why}")

@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING, Any, NamedTuple, Protocol, runtime_checkable
 
 import numpy as np
 
-from config.extensions import maker, registered
+from config.extensions import maker, schemas
 from config.output_schema import AlertSection
 from estimators.errors import ConfigError, NisusError, printable
 
@@ -139,7 +139,7 @@ class Publisher:
         secrets = secrets_of(section, twin.loaded.places)
         outputs: dict[str, Output] = {
             key: maker("outputs", key)(own, self._engine, secrets)
-            for key in registered("outputs")
+            for key in schemas("outputs")
             if (own := getattr(section, key, None)) is not None
         }
         for key, output in outputs.items():

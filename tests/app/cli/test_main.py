@@ -24,8 +24,8 @@ FULL = Path("/dev/full")
 needs_full = pytest.mark.skipif(not FULL.exists(), reason="there is no /dev/full")
 
 
-def test_twins_are_listed_without_numba():
-    run_python("import sys; from app.cli.main import main; main(['twins']); assert 'numba' not in sys.modules")
+def test_twins_are_listed_without_numba_and_pydantic():
+    run_python("import sys, app.cli.main as it; it.main(['twins']); assert not {'numba', 'pydantic'} & {*sys.modules}")
 
 
 @pytest.mark.parametrize(
