@@ -93,6 +93,8 @@ RESERVED: Mapping[str, tuple[str, ...]] = {
 """Names of the core by kind, which no extension may take; commands of the core come before those of one name."""
 
 GUARDED = ("sources", "outputs", "receivers", "models", "routes", "panels")
+"""Kinds whose functions end in a line, not in a traceback; see `maker`."""
+
 TAGGED = ("sources", "receivers")
 """Kinds of which a section is recognised by its `type`, a literal that is the name of the part."""
 
@@ -181,7 +183,7 @@ def maker(kind: Kind, key: str, asked: str = "", extra: str = "") -> Callable[..
         ConfigError: If no extension has it, or it cannot be imported.
     """
     if key not in registered(kind):
-        rule = f"needs an extension; install it with `pip install 'nisus[{extra}]'`"
+        rule = f"needs an extension; install it with `pip install 'nisus[{extra}]'`" if extra else "no extension has it"
         raise ConfigError(f"{asked}: {rule}{left_out()}")
     name, part = registered(kind)[key]
     try:

@@ -202,7 +202,7 @@ class PageServer:
 
     def _panel(self, title: str) -> Response:
         """Answer with the script of a tab that an extension adds."""
-        return Response(str(maker("panels", title, f"the tab {title}", "EXTENSION")()), media_type="text/javascript")
+        return Response(str(maker("panels", title, f"the tab {title}")()), media_type="text/javascript")
 
     def _index(self) -> Response:
         """Answer with the page."""
