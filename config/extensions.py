@@ -50,9 +50,9 @@ class Extension:
     sources: Parts = field(default_factory=dict)
     """Live sources of messages, by `source.type`. `make(opening)` opens one (`app.twin.sources.kind.Opening`)."""
     outputs: Parts = field(default_factory=dict)
-    """By key under `outputs`. `make(section, engine, secrets)` returns an `app.outputs.Output`."""
+    """By key under `outputs`. `make(section, engine, secrets)` returns an `app.engine.outputs.publisher.Output`."""
     receivers: Parts = field(default_factory=dict)
-    """Receivers of alerts, by `type`; `make(section, folder, secrets)` returns an `app.outputs.receivers.Receiver`. An
+    """Receivers of alerts, by `type`; `make(section, folder, secrets)` returns an `app.engine.outputs.receivers.Receiver`. An
     output of the same name is the receiver itself."""
     models: Parts = field(default_factory=dict)
     """Models in files, by the key of the file in `model`. `make(loaded, section, path)` returns a StateSpaceModel."""
@@ -60,7 +60,7 @@ class Extension:
     """Of `learned`: `file`. `make(loaded, model, path)` returns a LearnedCorrection, and its place for errors."""
     executors: Parts = field(default_factory=dict)
     """Work on other machines, at the address that `--cluster` gives. `calls`: `make(address, begin, given)`; `folds`:
-    `make(address, twin, held, name, overrides)`. Each is a context manager; see `app.studies.processes`."""
+    `make(address, twin, held, name, overrides)`. Each is a context manager; see `app.study.processes`."""
     tables: Parts = field(default_factory=dict)
     """Files of tables, by the ending of the name. `make` is a `sources.tables.rows.TableFormat`."""
     folders: Parts = field(default_factory=dict)

@@ -16,7 +16,7 @@ from PIL import Image, ImageDraw
 from playwright.sync_api import Browser, Page
 
 from app.cli.open_twin import live_source
-from app.live.commands import InjectFault, Pause, SetEstimator, SetTunings
+from app.engine.commands import InjectFault, Pause, SetEstimator, SetTunings
 from app.twin.twin import load_twin
 from app.web.running import OpenedTwin
 from app.web.session import Page as Served

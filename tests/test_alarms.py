@@ -6,8 +6,8 @@ from pathlib import Path
 
 import pytest
 
-from app.live.outputs import Status
-from app.outputs.alerts import GUIDES
+from app.engine.copies import Status
+from app.engine.outputs.alerts import GUIDES
 from config.schema import TwinSection
 from estimators.diagnostics.detector_state import SENSOR_STATES
 from estimators.diagnostics.detectors import ALARM_NAMES, CAUSES, DETECTORS, anchor
@@ -92,7 +92,7 @@ def notices():
             if isinstance(node, ast.Call) and "report" in (getattr(name, "attr", ""), getattr(name, "id", "")):
                 found |= {arg.value for arg in node.args[:1] if isinstance(arg, ast.Constant)}
     values = {}
-    for path in (ROOT / "app/ingest.py", ROOT / "sources/source.py"):
+    for path in (ROOT / "app/twin/ingest.py", ROOT / "sources/source.py"):
         for names in constants_of(path):
             values |= names
     found |= {values[name] for name in ("WRONG_TIME", "CLOCK_MOVED", "MAINTENANCE")}

@@ -116,7 +116,7 @@ def test_circles_are_found():
 
 def test_the_reader_of_imports_sees_every_form():
     source = """
-import app.live
+import app.engine
 from app import live
 from . import errors
 from .errors import ModelError
@@ -127,8 +127,8 @@ if TYPE_CHECKING:
     import config.schema as schema
 """
     assert imported(source, "estimators.models") == [
-        "app.live",
-        "app.live",
+        "app.engine",
+        "app.engine",
         "estimators.models.errors",
         "estimators.models.errors.ModelError",
         "estimators.sources.can_bus",

@@ -14,23 +14,14 @@ from estimators.log import READING, Log
 from sources.formats import is_whole
 
 from ..format_time import counted
-from ..present.result import TableColumn, Topic, to_json, to_text
-from ..studies.advice.draft import check_new, hint_lines, write_draft
-from ..studies.advice.measured import AdviceProgress, Measured, digits, percent, seconds_text, without_faults
-from ..studies.advice.plan import DraftPlan, Moves, plan, redundant, unit_ratio
-from ..studies.advice.relations import Pair
-from ..studies.advice.signals import Signal, signals
-from ..studies.advice.verdict import (
-    Advice,
-    advice_json,
-    changed,
-    details,
-    exclusion_text,
-    finding,
-    lasting_lines,
-    lines,
-)
-from ..studies.advice.verdict import advise as recommend
+from ..result import TableColumn, Topic, to_json, to_text
+from ..study.advice.draft import check_new, hint_lines, write_draft
+from ..study.advice.measured import AdviceProgress, Measured, digits, percent, seconds_text, without_faults
+from ..study.advice.plan import DraftPlan, Moves, plan, redundant, unit_ratio
+from ..study.advice.relations import Pair
+from ..study.advice.signals import Signal, signals
+from ..study.advice.verdict import Advice, advice_json, changed, details, exclusion_text, finding, lasting_lines, lines
+from ..study.advice.verdict import advise as recommend
 from ..twin.log_reader import read_log
 from ..twin.twin import Twin, load_twin
 from .log import databases_of, look

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Any
 
 from estimators.errors import ConfigError
 
-from ..present.result import to_json
+from ..result import to_json
 from ..terminal import complain, until_asked_to_end
 from ..twin.twin import Twin, load_twin
 from .options import overrides_of

@@ -6,10 +6,10 @@ from typing import TYPE_CHECKING
 
 from config.yaml_files import writing
 
-from ..present.result import to_html, to_json, to_text
-from ..studies.check import Checked, check, figures, topics
-from ..studies.checklist import checklist
-from ..studies.processes import executor_of
+from ..result import to_html, to_json, to_text
+from ..study.check import Checked, check, figures, topics
+from ..study.checklist import checklist
+from ..study.processes import executor_of
 from ..twin.log_reader import read_log
 from ..twin.twin import with_held
 from .prepare import attend, overrides_of, prepared

@@ -9,15 +9,15 @@ from estimators.diagnostics.detector_tests import COVERED
 from estimators.diagnostics.episodes import episodes
 from estimators.track import HEALTH_NAMES, STALE
 
+from ..engine.watchdog import interruptible
 from ..format_time import duration_text
-from ..live.tunings.versions import write_section
-from ..live.watchdog import interruptible
-from ..present.result import to_json
-from ..studies.commission import baseline_of, lines, section_file
-from ..studies.fold_result import coverage_of
+from ..result import to_json
+from ..study.commission import baseline_of, lines, section_file
+from ..study.fold_result import coverage_of
 from ..terminal import complain
 from ..twin.log_reader import read_log
 from ..twin.twin import load_twin
+from ..twin.versions import write_section
 from .options import overrides_of
 from .prepare import prepare
 

@@ -7,9 +7,9 @@ from typing import TYPE_CHECKING, Any
 from config.loader import shipped
 from estimators.errors import ConfigError, SourceError
 
-from ..present.result import to_json
-from ..studies.compare import applicable, best_text, compare, without_marks
-from ..studies.scores import FilterScore, cells, printed, row_json, write_scores
+from ..result import to_json
+from ..study.compare import applicable, best_text, compare, without_marks
+from ..study.scores import FilterScore, cells, printed, row_json, write_scores
 from ..terminal import complain
 from ..twin.log_reader import read_logs
 from ..twin.twin import load_twin

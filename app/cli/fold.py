@@ -15,8 +15,9 @@ from estimators.diagnostics.score import score
 from estimators.errors import ConfigError
 from estimators.registry import find_estimator
 
-from ..present.result import to_json, to_text
-from ..studies.fold_result import (
+from ..record.rrd_file import TAKEN
+from ..result import to_json, to_text
+from ..study.fold_result import (
     FoldResult,
     calibration_of,
     coverage_of,
@@ -32,9 +33,8 @@ from ..studies.fold_result import (
     with_covariance,
     within,
 )
-from ..studies.scores import pictures_of
+from ..study.scores import pictures_of
 from ..twin.log_reader import read_log
-from ..views.recording.rrd_file import TAKEN
 from .options import span_of
 from .prepare import attend, fold_log, opened, prepare
 
@@ -92,8 +92,8 @@ def fold_twin(arguments: Arguments) -> int:
     if out is not None:
         _write(out, result, smoothed, write)
     if arguments.html is not None:
-        from ..present.export.report import Reported, report
-        from ..present.result import to_html
+        from ..render.report import Reported, report
+        from ..result import to_html
 
         run = Reported(
             twin, twin.estimator, twin.tuning, events, track, pictures,
@@ -116,7 +116,7 @@ def _write(path: Path, result: FoldResult, smoothed: Smoothed | None, write: Cal
     twin, fold = result.twin, result.fold
     found = [item.episode for item in result.episodes]
     if path.suffix == ".rrd":
-        from ..views.recording.writer import write_recording
+        from ..record.writer import write_recording
 
         write_recording(path, twin, fold.log, fold.track, pictures_of(fold), found, smoothed)
         return
@@ -126,7 +126,7 @@ def _write(path: Path, result: FoldResult, smoothed: Smoothed | None, write: Cal
         return
     from estimators.interface.table import table_of
 
-    from ..present.export.track_file import encoded
+    from ..render.track_file import encoded
 
     table = table_of(
         twin.model, fold.log.events, fold.track, found, smoothed=smoothed,

@@ -26,9 +26,9 @@ from sources.inspect import (
 from sources.tables.times import SERIAL_DAYS, UNITS, TimeColumn
 
 from ..format_time import FIRST_DATED_NS, duration_text, format_time
-from ..present.result import Cell, TableColumn, Topic, to_json, to_text
-from ..studies.advice.draft import undecided_lines
-from ..studies.advice.signals import signals
+from ..result import Cell, TableColumn, Topic, to_json, to_text
+from ..study.advice.draft import undecided_lines
+from ..study.advice.signals import signals
 from ..terminal import complain
 
 if TYPE_CHECKING:

@@ -59,7 +59,7 @@ def carry_out(command: Any) -> int:
     module, _, function = COMMANDS[type(command)].partition(":")
     workers: tuple[Any, ...] = ()
     if isinstance(command, RunCommand) and command.twin is not None and not command.headless:
-        from ..live.compilers import first_compilers
+        from ..engine.compilers import first_compilers
 
         workers = (first_compilers(),)  # started before the imports of `run`, which take seconds
     return int(getattr(_imported(f"{__package__}.{module}"), function)(command, *workers))

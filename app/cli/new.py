@@ -9,12 +9,12 @@ from typing import TYPE_CHECKING, Any
 from config.yaml_files import writing
 from estimators.errors import ConfigError
 
-from ..present.result import to_json
+from ..result import to_json
 from .options import roles_of
 
 if TYPE_CHECKING:
-    from ..studies.advice.draft import Draft
-    from ..studies.advice.plan import DraftPlan
+    from ..study.advice.draft import Draft
+    from ..study.advice.plan import DraftPlan
     from .arguments import NewCommand as Arguments
     from .arguments import SchemaCommand
 
@@ -151,8 +151,8 @@ def new_twin(arguments: Arguments) -> int:
         SourceError: If a recording cannot be read.
     """
     if arguments.log:
-        from ..studies.advice.draft import check_new, write_draft
-        from ..studies.advice.plan import plan
+        from ..study.advice.draft import check_new, write_draft
+        from ..study.advice.plan import plan
         from .log import databases_of, look
 
         check_new(arguments.name, arguments.folder)
@@ -174,7 +174,7 @@ def fit_draft(drafted: DraftPlan) -> DraftPlan:
     """Fit a draft and check it, with progress; Ctrl-C keeps what has been fitted, and checks that."""
     from estimators.fit.objective import FitProgress
 
-    from ..studies.advice.draft_fit import fit_all
+    from ..study.advice.draft_fit import fit_all
     from .prepare import attend
 
     state, steps = FitProgress(), [""]
@@ -207,8 +207,8 @@ def roles_json(drafted: DraftPlan) -> dict[str, Any]:
 
 def report_draft(draft: Draft, json: bool) -> None:
     """Print the files of a draft, its check, and the next step."""
-    from ..studies.advice.draft import check_lines, hint_lines, omission_lines
-    from ..studies.advice.plan import YAML_NAME
+    from ..study.advice.draft import check_lines, hint_lines, omission_lines
+    from ..study.advice.plan import YAML_NAME
 
     check = draft.plan.check
     written = [str(path) for path in draft.paths]
@@ -244,7 +244,7 @@ def write_twin(name: str, folder: Path) -> tuple[Path, Path]:
     Raises:
         ConfigError: If the name or the folder will not do, or one of the files is there already.
     """
-    from ..studies.advice.draft import check_new, model_of, write_pair
+    from ..study.advice.draft import check_new, model_of, write_pair
 
     check_new(name, folder)
     model = model_of(name)

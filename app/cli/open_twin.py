@@ -14,9 +14,9 @@ import numpy as np
 from config.extensions import maker
 from config.loader import shipped
 
+from ..record.rrd_file import NEVER, Split
 from ..twin.log_reader import remarking
 from ..twin.twin import Twin, load_twin, restore_twin
-from ..views.recording.rrd_file import NEVER, Split
 from ..web.gallery.api import GalleryApi
 from ..web.gallery.gallery import Gallery, Opener, SavedFiles, StartRequest
 from ..web.gallery.recordings import Recordings
@@ -27,8 +27,8 @@ from .prepare import begin_to_compile, compile_for, prepare_model
 if TYPE_CHECKING:
     from sources.source import Source
 
-    from ..live.compilers import Compiler
-    from ..views.recording.reader import Recorded
+    from ..engine.compilers import Compiler
+    from ..record.reader import Recorded
 
 
 def live_source(twin: Twin, speed: float | None = None) -> Callable[[Callable[[str, str], None]], Source]:
@@ -79,7 +79,7 @@ def recorded_twin(recorded: Recorded) -> Twin:
 
     The baseline of the innovations is not part of the tuning and comes from the YAML.
     """
-    from ..live.fold_json import tuning_from_json
+    from ..engine.fold_json import tuning_from_json
 
     twin = restore_twin(recorded.text, recorded.twin_path, recorded.overrides, recorded.version)
     tuning, estimator = tuning_from_json(recorded.tuning, twin.model)
@@ -93,7 +93,7 @@ def opened_review(path: Path) -> OpenedTwin:
     Raises:
         NisusError: If the recording cannot be read, or its model is not there.
     """
-    from ..views.recording.reader import read_recording
+    from ..record.reader import read_recording
 
     recorded = read_recording(path)
 

@@ -15,7 +15,7 @@ from estimators.errors import ConfigError, nearest, quoted
 if TYPE_CHECKING:
     from estimators.log import Events
 
-    from ..studies.advice.plan import Roles
+    from ..study.advice.plan import Roles
     from .arguments import PartOptions, RoleOptions
 
 
@@ -45,7 +45,7 @@ def names_of(text: str) -> tuple[str, ...]:
 
 def roles_of(options: RoleOptions) -> Roles:
     """Return the roles of signals that options give."""
-    from ..studies.advice.plan import Roles
+    from ..study.advice.plan import Roles
 
     return Roles(*map(names_of, (options.sensors, options.inputs, options.hold_out, options.signals)))
 

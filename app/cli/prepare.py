@@ -16,10 +16,10 @@ from estimators.model.state_space import StateSpaceModel
 from estimators.registry import ESTIMATORS, unfit
 from sources.pieces import make, pieces_of
 
-from ..live.compilers import Compiler
-from ..live.jobs import LoopThread, start_in_thread
-from ..live.watchdog import CallWatch, interruptible
-from ..live.workshop import Workshop
+from ..engine.compilers import Compiler
+from ..engine.jobs import LoopThread, start_in_thread
+from ..engine.watchdog import CallWatch, interruptible
+from ..engine.workshop import Workshop
 from ..terminal import complain, messages_file
 from ..twin.twin import Twin, load_twin
 from .options import overrides_of

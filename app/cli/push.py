@@ -21,7 +21,7 @@ from urllib.request import ProxyHandler, Request, build_opener
 
 from estimators.errors import ConfigError, nearest, quoted, shown_name
 
-from ..present.result import to_json
+from ..result import to_json
 from ..terminal import complain
 from .arguments import PushCommand as Arguments
 

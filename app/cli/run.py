@@ -10,10 +10,10 @@ from typing import TYPE_CHECKING
 
 from estimators.errors import ConfigError
 
-from ..live.execute import MAX_SPEED
-from ..present.result import to_json
+from ..engine.execute import MAX_SPEED
+from ..record.rrd_file import TAKEN, check_date, parse_split
+from ..result import to_json
 from ..terminal import complain
-from ..views.recording.rrd_file import TAKEN, check_date, parse_split
 from ..web.door import check_port
 from ..web.gallery.gallery import StartRequest
 from ..web.gate import grants_of
@@ -25,7 +25,7 @@ from .prepare import prepare
 if TYPE_CHECKING:
     from collections.abc import Sequence
 
-    from ..live.compilers import Compiler
+    from ..engine.compilers import Compiler
     from ..web.running import OpenedTwin
     from .arguments import PageOptions, ReviewCommand, RunCommand
 

@@ -21,17 +21,17 @@ from estimators.fit.objective import FitProgress
 from estimators.fit.recording import BLOCKS, Recording
 from sources.formats import check_once
 
-from ..live.tunings.tuning_yaml import tuning_yaml
-from ..live.tunings.versions import apply_tuning, check_free, keep, settings_of, version_text, widths_of
-from ..present.result import to_text
-from ..present.runs_json import fit_json
-from ..studies.fold_result import rows_of
-from ..studies.processes import executor_of
-from ..studies.tune import fit_text, heading, sections, window_json, window_topics, windows_verdict
+from ..render.runs_json import fit_json
+from ..result import to_text
+from ..study.fold_result import rows_of
+from ..study.processes import executor_of
+from ..study.tune import fit_text, heading, sections, window_json, window_topics, windows_verdict
 from ..terminal import complain
 from ..twin.defaults import bounds_of, natural_aim, width_priors
 from ..twin.log_reader import read_log, read_logs
+from ..twin.tuning_yaml import tuning_yaml
 from ..twin.twin import Twin, load_twin, with_held
+from ..twin.versions import apply_tuning, check_free, keep, settings_of, version_text, widths_of
 from .options import check_output, names_of, overrides_of, seconds_of, span_of
 from .prepare import attend, fold_log, prepare
 

@@ -11,8 +11,12 @@ from config.yaml_files import shown_path
 from estimators.diagnostics.score import score
 from estimators.errors import ConfigError, printable
 
-from ..live.changes import difference, value_text
-from ..live.tunings.versions import (
+from ..result import TableColumn, Topic, to_json, to_text
+from ..study.scores import pictures_of
+from ..twin.changes import difference, value_text
+from ..twin.log_reader import read_log
+from ..twin.twin import load_twin
+from ..twin.versions import (
     COVERAGE,
     LIKELIHOOD,
     NIS,
@@ -26,10 +30,6 @@ from ..live.tunings.versions import (
     listing,
     version_text,
 )
-from ..present.result import TableColumn, Topic, to_json, to_text
-from ..studies.scores import pictures_of
-from ..twin.log_reader import read_log
-from ..twin.twin import load_twin
 from .prepare import fold_log, prepared
 
 if TYPE_CHECKING:

@@ -24,7 +24,7 @@ def show_twins(arguments: Arguments) -> int:
     from config.extensions import maker
     from config.loader import load
 
-    from ..present.result import to_json
+    from ..result import to_json
 
     if arguments.picture:
         draw = maker("pictures", "twin", "--picture", "plot")
@@ -55,7 +55,7 @@ def _head(loaded: Loaded) -> dict[str, Any]:
 
 def _json(loaded: Loaded) -> dict[str, Any]:
     """Return head, leading comment of the YAML, and scores: figures as numbers, texts as they are."""
-    from ..studies.scores import read_scores
+    from ..study.scores import read_scores
 
     numbers = [{key: _number(cell) for key, cell in line.items()} for line in read_scores(loaded.path)]
     return {**_head(loaded), "description": "\n".join(_prose(loaded)), "scores": numbers}
@@ -77,7 +77,7 @@ def _prose(loaded: Loaded) -> list[str]:
 
 def described(loaded: Loaded) -> list[str]:
     """Return title, leading comment of the YAML, and scores as lines of text."""
-    from ..studies.scores import printed, read_scores
+    from ..study.scores import printed, read_scores
 
     name = loaded.path.stem
     scores = read_scores(loaded.path)

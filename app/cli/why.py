@@ -9,8 +9,8 @@ import numpy as np
 from estimators.attribution import Attribution, attribution
 from estimators.errors import ConfigError, nearest
 
-from ..present.result import to_json, to_text
-from ..studies.analysis.why import why_json, why_topics
+from ..result import to_json, to_text
+from ..study.why import why_json, why_topics
 from ..twin.log_reader import read_log
 from .options import moment_of
 from .prepare import attend, prepared

@@ -17,8 +17,8 @@ from sources.source import LOST_FRAMES, NEVER, NO_ASSET, TRUNCATED, UNASSIGNED, 
 from sources.tables.order import REMARKS as ORDER
 from sources.tables.text import UNREADABLE
 
-from ..ingest import CLOCK_MOVED, UNSET, Ingest
 from ..terminal import complain
+from .ingest import CLOCK_MOVED, UNSET, Ingest
 from .twin import Twin, load_twin
 
 if TYPE_CHECKING:

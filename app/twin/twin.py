@@ -28,9 +28,9 @@ from estimators.model.state_space import StateSpaceModel
 from estimators.registry import checked, find_entry, find_estimator
 from estimators.tuning import CHANGED_MARK, Tuning
 
-from ..ingest import Planned, UnknownInputs
 from .checks import check_named, check_names, check_outputs, check_refit, check_scene, commissioned
 from .defaults import DegradedAfter, Late, degraded_after, driven_states, late_policy, parameter_sections
+from .ingest import Planned, UnknownInputs
 from .landmarks import expanded
 from .model import configure, find_model, model_files
 from .source import Plan, plan_source

@@ -12,9 +12,9 @@ from pydantic import TypeAdapter
 
 from estimators.errors import ConfigError, nearest
 
-from ..live import commands
-from ..live.execute import prepared
-from ..live.running_fold import Running
+from ..engine import commands
+from ..engine.execute import prepared
+from ..engine.running_fold import Running
 from .http import parse, shown
 
 MAX_NAME_BYTES = 255

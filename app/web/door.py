@@ -35,7 +35,7 @@ from uvicorn.protocols.http.h11_impl import H11Protocol
 
 from estimators.errors import ConfigError
 
-from ..live.jobs import LoopThread
+from ..engine.jobs import LoopThread
 from .gate import SESSION, USER, Gate, Grant, User, changes, with_security_headers
 from .http import MAX_BODY_BYTES
 

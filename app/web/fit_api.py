@@ -9,18 +9,18 @@ from starlette.routing import Route
 
 from estimators.errors import ConfigError
 
-from ..live.history_copy import copy_log
-from ..live.jobs import Job
-from ..live.running_fold import Running
-from ..live.runs.refits import FITTING, STOPPING, FitAttempt, Fitting, LiveRefit, Refits
-from ..live.tunings.versions import keep, settings_of, version_text
+from ..derive.refits import FITTING, STOPPING, FitAttempt, Fitting, LiveRefit, Refits
+from ..engine.history_copy import copy_log
+from ..engine.jobs import Job
+from ..engine.running_fold import Running
+from ..twin.versions import keep, settings_of, version_text
 from .http import get, one_line, post
 from .runs_api import checked_note
 
 if TYPE_CHECKING:
     from estimators.fit.fit import Fitted
 
-    from ..studies.advice.measured import AdviceProgress
+    from ..study.advice.measured import AdviceProgress
 
 
 class FitApi:
@@ -152,7 +152,7 @@ def _progress_json(attempt: FitAttempt) -> dict[str, Any]:
     progress, elapsed = attempt.progress, attempt.job.elapsed
     found |= {"elapsed": elapsed, "expected": None, "left": None, "gain": 0.0, "best": ""}
     if progress is not None and progress.folds:
-        from ..studies.tune import moves_text  # which imports SciPy's optimisers too
+        from ..study.tune import moves_text  # which imports SciPy's optimisers too
 
         expected = max(progress.expected, progress.folds)
         left = elapsed / progress.folds * (expected - progress.folds)
@@ -161,7 +161,7 @@ def _progress_json(attempt: FitAttempt) -> dict[str, Any]:
 
 
 def _result_json(fitted: Fitted) -> dict[str, Any]:
-    from ..present.runs_json import fit_json  # which imports SciPy's optimisers, 0.5 s
+    from ..render.runs_json import fit_json  # which imports SciPy's optimisers, 0.5 s
 
     return {"result": fit_json(fitted)}
 
@@ -224,8 +224,8 @@ class Advising:
 
     def measure(self, job: Job) -> dict[str, Any]:
         """Return the advice on a copy of the log, as JSON."""
-        from ..studies.advice.measured import AdviceProgress, Measured, without_faults
-        from ..studies.advice.verdict import advice_json, advise
+        from ..study.advice.measured import AdviceProgress, Measured, without_faults
+        from ..study.advice.verdict import advice_json, advise
 
         engine = self._engine
         self._progress = AdviceProgress(check=job.check)

@@ -23,7 +23,7 @@ from starlette.routing import BaseRoute, Route
 
 from estimators.errors import ConfigError, NisusError, nearest, printable, quoted, shown_name
 
-from ..live.jobs import start_in_thread
+from ..engine.jobs import start_in_thread
 from .request_threads import in_thread
 
 T = TypeVar("T")

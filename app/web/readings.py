@@ -18,8 +18,8 @@ from starlette.routing import BaseRoute, Route
 from estimators.errors import ConfigError, shown_name
 from sources.messages import ACCEPTED, CLOSED, DUPLICATE, NO_ROOM, REFUSED, Answer, Messages
 
-from ..live.outcomes import Outcomes
-from ..live.running_fold import Keeper
+from ..engine.outcomes import Outcomes
+from ..engine.running_fold import Keeper
 from ..twin.twin import Twin
 from .http import Json, TooLarge, bounded_body, get, refusal
 from .request_threads import in_thread

@@ -11,7 +11,7 @@ from functools import partial
 from queue import SimpleQueue
 from typing import Any, TypeVar
 
-from ..live.jobs import carry_out
+from ..engine.jobs import carry_out
 
 T = TypeVar("T")
 

@@ -10,23 +10,23 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from ..live.engine import Engine
-from ..live.jobs import run_all
-from ..live.runs.refits import Refits
-from ..live.store import StoreWriter, open_store
-from ..outputs import Publisher
+from ..derive.refits import Refits
+from ..engine.engine import Engine
+from ..engine.jobs import run_all
+from ..engine.outputs.publisher import Publisher
+from ..engine.store import StoreWriter, open_store
+from ..record.rrd_file import NEVER, Split
+from ..record.writer import ALL_STRETCHES, Recorder
 from ..terminal import complain, print_line
-from ..views.recording.rrd_file import NEVER, Split
-from ..views.recording.writer import ALL_STRETCHES, Recorder
 
 if TYPE_CHECKING:
     from estimators.snapshots import Base
     from sources.source import Source
 
-    from ..live.notices import Annotation
-    from ..live.workshop import Workshop
+    from ..engine.notices import Annotation
+    from ..engine.workshop import Workshop
+    from ..explore.rows import RerunRows
     from ..twin.twin import Twin
-    from ..views.rerun.rows import RerunRows
     from .door import Door
 
 
@@ -147,7 +147,7 @@ class RunningTwin:
         self.gone: threading.Event | None = None
         """After the start: set once the application shown before has no connection left."""
         if door is not None:
-            from ..views.viser.view import ViserView
+            from ..scene.view import ViserView
             from .server import PageServer
 
             secret = secrets.token_urlsafe(24)
@@ -168,7 +168,7 @@ class RunningTwin:
 
     def _draw_into(self, stream: Any) -> RerunRows:
         """Return a function that logs the charts of a pull into a Rerun stream."""
-        from ..views.rerun.rows import RerunRows
+        from ..explore.rows import RerunRows
 
         return RerunRows(stream, self.engine, series=ALL_STRETCHES)
 

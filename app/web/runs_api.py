@@ -16,21 +16,21 @@ from estimators.diagnostics.episodes import Episode
 from estimators.diagnostics.sensitivity.responses import digits
 from estimators.errors import ConfigError, printable
 
-from ..live.changes import difference
-from ..live.revisions import MAX_NOTE_LENGTH, Revision
-from ..live.running_fold import Running
-from ..live.runs.scores import RunScores
-from ..live.runs.sweep import Sweeps, noise
-from ..live.tunings.tuning_yaml import tuning_yaml
-from ..live.tunings.versions import Settings, figures, keep, listing, load_into, verdicts, version_text
-from ..present.export.report import Reported, report
-from ..present.export.track_file import KINDS, encoded, rows_of_run, tables
-from ..present.result import to_html
-from ..present.runs_json import changes_json, noise_json, runs_json, swept_json, what_changed
-from ..present.series.chart_stream import Seconds
-from ..present.series.series import Series
-from ..studies.commission import commission_running
+from ..charts.chart_stream import Seconds
+from ..charts.series import Series
+from ..derive.run_scores import RunScores
+from ..derive.sweep import Sweeps, noise
+from ..engine.revisions import MAX_NOTE_LENGTH, Revision
+from ..engine.running_fold import Running
+from ..render.report import Reported, report
+from ..render.runs_json import changes_json, noise_json, runs_json, swept_json, what_changed
+from ..render.track_file import KINDS, encoded, rows_of_run, tables
+from ..result import to_html
+from ..study.commission import commission_running
+from ..twin.changes import difference
+from ..twin.tuning_yaml import tuning_yaml
 from ..twin.twin import with_version
+from ..twin.versions import Settings, figures, keep, listing, load_into, verdicts, version_text
 from .http import OneAtATime, get, post
 
 MAX_ERRORS = 6

@@ -23,19 +23,19 @@ from starlette.websockets import WebSocket
 from config.extensions import made, maker, registered
 from estimators.errors import ConfigError, NisusError
 
-from ..live.engine import STATUS_PERIOD_S
-from ..live.faults import catalogue_json
-from ..live.running_fold import Running
-from ..live.runs.refits import Refits
-from ..outputs.alerts import alert_schema
-from ..present.drawing.colors import EITHER, THEMES
-from ..present.export.alarm_guide import alarms_text, as_html
-from ..present.result import plain
-from ..present.series.series import Series
-from ..present.state_message import StateMessage, state_message, state_schema
-from ..studies.analysis.diagnosis import Diagnosis
-from ..studies.analysis.forecast import Forecasts, question_from_json
-from ..studies.analysis.why import change_of, why_json
+from ..charts.colors import EITHER, THEMES
+from ..charts.series import Series
+from ..derive.diagnosis import Diagnosis
+from ..derive.forecast import Forecasts, question_from_json
+from ..derive.refits import Refits
+from ..engine.engine import STATUS_PERIOD_S
+from ..engine.faults import catalogue_json
+from ..engine.outputs.alarm_guide import alarms_text, as_html
+from ..engine.outputs.alerts import alert_schema
+from ..engine.outputs.state_message import StateMessage, state_message, state_schema
+from ..engine.running_fold import Running
+from ..result import plain
+from ..study.why import change_of, why_json
 from ..terminal import messages_file
 from . import readings
 from .commands_json import command_from_json, commands_schema
@@ -50,9 +50,9 @@ from .viewer_assets import FILES, viewer_assets, viewer_version
 from .viser_proxy import ViserProxy
 
 if TYPE_CHECKING:
-    from ..present.drawing.colors import Palette
-    from ..views.rerun.feed import RerunFeed
-    from ..views.viser.stage import Choices
+    from ..charts.colors import Palette
+    from ..explore.feed import RerunFeed
+    from ..scene.stage import Choices
 
 COMPILE_POLL_PERIOD_S = 0.5
 """Between two looks at whether the first filter is compiled."""
@@ -259,7 +259,7 @@ class PageServer:
         return catalogue_json(self._engine.source, self._engine.model)
 
     def _command(self, body: Any) -> dict[str, str]:
-        """Carry out `{"command": NAME, field: value, ...}` (app/live/commands.py)."""
+        """Carry out `{"command": NAME, field: value, ...}` (app/engine/commands.py)."""
         command = command_from_json(body, self._engine)
         self._engine.submit(command)
         return {"submitted": type(command).__name__}
@@ -363,7 +363,7 @@ class PageServer:
 
     def _rerun_feed(self, layout: bool, palette: Palette) -> RerunFeed:
         """Return a feed of Explore; Rerun takes 50 MB, so it is imported with the first one."""
-        from ..views.rerun.feed import RerunFeed
+        from ..explore.feed import RerunFeed
 
         return RerunFeed(self._engine, layout=layout, palette=palette)
 

@@ -20,18 +20,18 @@ from typing import TYPE_CHECKING, Protocol
 
 from estimators.errors import SourceError
 
-from ..live.commands import Record
-from ..live.jobs import run_all
+from ..engine.commands import Record
+from ..engine.jobs import run_all
+from ..record.rrd_file import NEVER, Split
 from ..terminal import complain, until_asked_to_end
-from ..views.recording.rrd_file import NEVER, Split
 from .door import Door
 from .gate import Grant
 from .running import OpenedTwin, RunningTwin
 
 if TYPE_CHECKING:
-    from ..live.engine import Engine
-    from ..live.notices import Annotation
-    from ..views.recording.writer import Recorder
+    from ..engine.engine import Engine
+    from ..engine.notices import Annotation
+    from ..record.writer import Recorder
 
 DISCONNECT_TIMEOUT_S = 3.0
 """Longest wait for browsers that keep connections to a stopped twin."""

@@ -18,17 +18,17 @@ from starlette.websockets import WebSocket, WebSocketDisconnect
 
 from estimators.errors import ConfigError, nearest
 
-from ..live.running_fold import Running
-from ..present.series.chart_stream import ChartQuery, ChartStream, Seconds
-from ..present.series.series import Series
+from ..charts.chart_stream import ChartQuery, ChartStream, Seconds
+from ..charts.series import Series
+from ..engine.running_fold import Running
 from .http import MAX_BODY_BYTES, one_line, parse
 from .request_threads import in_rerun_thread, in_thread
 from .twin_json import annotations_json, episodes_json, moment_json
 
 if TYPE_CHECKING:
-    from ..live.notices import Annotation
-    from ..views.rerun.feed import RerunFeed
-    from ..views.viser.stage import Choices
+    from ..engine.notices import Annotation
+    from ..explore.feed import RerunFeed
+    from ..scene.stage import Choices
 
 FRAME_PERIOD_S = 0.1
 STATUS_PERIOD_S = 0.25

@@ -10,16 +10,16 @@ from estimators.diagnostics.references import state_grades
 from estimators.registry import ESTIMATORS, unfit
 from estimators.track import HEALTH_NAMES
 
-from ..live import faults
-from ..live.changes import began_as, turned
-from ..live.outputs import Status
-from ..live.running_fold import Running
-from ..present.export.report_charts import charted_model
-from ..present.result import plain
-from ..present.runs_json import nis_json
-from ..present.sensor_groups import groups_json, sensor_groups
-from ..present.series.columns import columns_of
-from ..studies.commission import storable
+from ..charts.sensor_groups import groups_json, sensor_groups
+from ..columns import columns_of
+from ..engine import faults
+from ..engine.copies import Status
+from ..engine.running_fold import Running
+from ..render.report_charts import charted_model
+from ..render.runs_json import nis_json
+from ..result import plain
+from ..study.commission import storable
+from ..twin.changes import began_as, turned
 
 STATUS_FIELDS = (
     "estimator", "options", "revision", "refolding", "awaited", "compiling", "t", "since", "cause", "episodes_open",

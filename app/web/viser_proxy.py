@@ -14,7 +14,7 @@ from starlette.responses import HTMLResponse, Response
 from starlette.websockets import WebSocket, WebSocketDisconnect
 from websockets.asyncio.client import ClientConnection, connect
 
-from ..views.viser.guarded_server import HEADER
+from ..scene.guarded_server import HEADER
 from .http import PAGE
 from .streams import serve
 

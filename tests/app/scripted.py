@@ -13,7 +13,7 @@ from types import SimpleNamespace
 
 import numpy as np
 
-from app.live.engine import Engine
+from app.engine.engine import Engine
 from app.twin.defaults import DegradedAfter, Late
 from config.schema import ViewSection
 from estimators.diagnostics.health import HealthPolicy

@@ -12,10 +12,10 @@ from urllib.parse import parse_qs, urlsplit
 from websockets.sync.client import connect
 from websockets.sync.server import serve
 
-from app.live.engine import Engine
-from app.live.tunings.versions import VERDICT_FILE
-from app.views.viser.guarded_server import HEADER
-from app.views.viser.stage import Choice, Choices
+from app.engine.engine import Engine
+from app.scene.guarded_server import HEADER
+from app.scene.stage import Choice, Choices
+from app.twin.versions import VERDICT_FILE
 from app.web.server import PageServer
 from config.tunings import folders
 from tests.app.scripted import Scripted

@@ -11,7 +11,7 @@ import pytest
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
-from app.ingest import CLOCK_MOVED, Ingest
+from app.twin.ingest import CLOCK_MOVED, Ingest
 from estimators.diagnostics.health import HealthPolicy
 from estimators.fold import Fold
 from estimators.log import MAINTENANCE, MARK, READING, RESET, TICK, TRUTH, Events, Log, sorted_order

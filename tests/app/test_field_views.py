@@ -6,10 +6,7 @@ import numpy as np
 import pytest
 from rerun.chunk import RrdReader
 
-from app.cli.run import open_review
-from app.live import commands
-from app.live.engine import Engine
-from app.present.drawing.colors import (
+from app.charts.colors import (
     ERROR,
     EXTREME_DOT,
     LARGE_DOT,
@@ -20,13 +17,16 @@ from app.present.drawing.colors import (
     Scale,
     sensor_colors,
 )
-from app.present.drawing.direct_readings import observed
+from app.charts.direct_readings import observed
+from app.cli.run import open_review
+from app.engine import commands
+from app.engine.engine import Engine
+from app.explore.feed import RerunFeed
+from app.explore.rows import RerunRows
+from app.record.writer import Recorder
+from app.scene import field_scenes as field_scene
+from app.scene.view import ViserView
 from app.twin.twin import load_twin
-from app.views.recording.writer import Recorder
-from app.views.rerun.feed import RerunFeed
-from app.views.rerun.rows import RerunRows
-from app.views.viser import field_scenes as field_scene
-from app.views.viser.view import ViserView
 from estimators.errors import ConfigError
 from estimators.log import READING
 from estimators.model.parts import Field

@@ -9,10 +9,10 @@ import threading
 import pytest
 
 from app.cli.open_twin import live_source
-from app.live.jobs import run_all
+from app.engine.jobs import run_all
+from app.record.reader import finished, read_recording
+from app.record.writer import RecordingPart
 from app.twin.twin import load_twin
-from app.views.recording.reader import finished, read_recording
-from app.views.recording.writer import RecordingPart
 from app.web.running import OpenedTwin, RunningTwin
 from tests import ROOT
 from tests.app.scripted import row_count

@@ -24,11 +24,11 @@ from pathlib import Path
 import numpy as np
 
 from app.extensions.lab.stress.scenario import Bench
-from app.live.tunings.versions import Settings, version_text
-from app.present.export.calibration_lines import health_shares
+from app.study.calibration_lines import health_shares
 from app.twin.defaults import bounds_of, natural_aim, width_priors
 from app.twin.log_reader import read_log
 from app.twin.twin import Twin, load_twin, with_held
+from app.twin.versions import Settings, version_text
 from estimators.diagnostics.references import references
 from estimators.diagnostics.score import health_of
 from estimators.diagnostics.sensitivity import bounds_of as levels_of

@@ -11,8 +11,8 @@ from typing import Any
 
 import numpy as np
 
-from app.studies.check import check
-from app.studies.processes import executor_of, results
+from app.study.check import check
+from app.study.processes import executor_of, results
 from app.twin.twin import load_twin, with_held
 from estimators.errors import NisusError
 from estimators.fit.fit import fit

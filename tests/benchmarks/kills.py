@@ -29,11 +29,11 @@ from typing import Any, NamedTuple, cast
 import numpy as np
 import pyarrow.parquet
 
+from app.engine.store import Store, read_store
 from app.extensions.fleet.plan import load_fleet
 from app.extensions.fleet.running import RunningFleet
 from app.extensions.fleet.table import arrow_table, in_name_order
 from app.extensions.mqtt.source import MqttSource, TopicMap, mqtt_client
-from app.live.store import Store, read_store
 from app.terminal import EndRequest, when_asked_to_end
 from app.twin.twin import Twin, load_twin
 from app.web.readings import messages_of

@@ -31,7 +31,7 @@ import can
 import numpy as np
 import pyarrow.parquet
 
-from app.views.recording.reader import read_recording
+from app.record.reader import read_recording
 from estimators.errors import SourceError
 from estimators.log import READING
 from tests.chromium import find_chromium, launched

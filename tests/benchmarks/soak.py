@@ -28,9 +28,9 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
+from app.engine.engine import Engine
+from app.engine.episode_log import MAX_EPISODES_PERIOD_S
 from app.extensions.lab.stress.scenario import asset_of
-from app.live.engine import Engine
-from app.live.episode_log import MAX_EPISODES_PERIOD_S
 from app.twin.twin import Twin, load_twin
 from estimators.log import MARK, Events
 from estimators.track import ADVISORY, HEALTH_NAMES, SUSPECT, TRACKING, VERDICT_NAMES

@@ -11,7 +11,7 @@ from statistics import median
 from time import perf_counter, process_time
 from typing import Any, NamedTuple, TypeAlias, TypeVar
 
-from app.present.result import number_text, plain
+from app.result import number_text, plain
 from estimators.errors import NisusError
 
 

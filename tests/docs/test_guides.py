@@ -128,7 +128,7 @@ def test_links_and_pictures_lead_to_files(path):
 
 @pytest.mark.parametrize("path", GUIDES, ids=name)
 def test_files_that_are_named_exist(path):
-    """Such as `app/live/jobs.py`, so that a file that moves takes the guides along."""
+    """Such as `app/engine/jobs.py`, so that a file that moves takes the guides along."""
     text = path.read_text(encoding="utf-8")
     named = re.findall(r"`((?:app|estimators|sources|config|tests|docs)/[\w/.]+)`", text)
     assert [file for file in named if not (ROOT / file).exists()] == []

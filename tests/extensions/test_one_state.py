@@ -12,17 +12,17 @@ import pytest
 from asyncua import ua
 from asyncua.sync import Client, Server
 
+from app.engine.outputs.publisher import Publisher
 from app.extensions.can_output.output import checksum, frames
 from app.extensions.opcua.output import STATUS_CODES, values_of
-from app.outputs import Publisher
 from app.twin.twin import load_twin
 from estimators import fold
 from estimators.errors import ConfigError, NisusError
 from estimators.log import READING, Log
 from sources.source import ignore
 from tests import ROOT
-from tests.app.outputs.pushed import BEGIN, push, pushed_twin
-from tests.app.outputs.test_alerts import state
+from tests.app.engine.outputs.pushed import BEGIN, push, pushed_twin
+from tests.app.engine.outputs.test_alerts import state
 from tests.app.scripted import notice_texts, pull_all
 from tests.cases import cases
 from tests.extensions.modbus.device import Device

@@ -6,7 +6,7 @@ import subprocess
 import tempfile
 from pathlib import Path
 
-from app.outputs.alerts import AlertMessage
+from app.engine.outputs.alerts import AlertMessage
 from app.twin.secrets import Secrets
 from estimators.compiled.orphan import killed_with_parent
 

@@ -9,8 +9,8 @@ from email.message import EmailMessage
 from pathlib import Path
 from typing import Any
 
-from app.outputs.alerts import AlertMessage
-from app.outputs.receivers import TIMEOUT_S, Deadline
+from app.engine.outputs.alerts import AlertMessage
+from app.engine.outputs.receivers import TIMEOUT_S, Deadline
 from app.twin.secrets import Secrets
 
 from .schema import EmailSection

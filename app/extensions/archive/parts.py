@@ -10,7 +10,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from app.views.recording.rrd_file import Disk, Split
+from app.record.rrd_file import Disk, Split
 from estimators.errors import SourceError
 from sources.source import Report
 

@@ -6,7 +6,7 @@ import sys
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from app.present.result import Topic, to_json, to_text
+from app.result import Topic, to_json, to_text
 from estimators.errors import ConfigError, nearest
 
 from .parts import parts_of

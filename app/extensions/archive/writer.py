@@ -14,9 +14,9 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from app.live.history_copy import last_written
-from app.live.jobs import LoopThread
-from app.live.outputs import Pull
+from app.engine.copies import Pull
+from app.engine.history_copy import last_written
+from app.engine.jobs import LoopThread
 from estimators.events.batch import MAINTENANCE
 from estimators.interface.table import table_of
 from sources.worker_process import gist
@@ -26,8 +26,8 @@ from .parts import DAY_NS, GROUP_ROWS, ArchivePlan, Part, parts_of, remove_surpl
 if TYPE_CHECKING:
     from pathlib import Path
 
-    from app.live.running_fold import Running, StoredTwin
-    from app.views.recording.rrd_file import Split
+    from app.engine.running_fold import Running, StoredTwin
+    from app.record.rrd_file import Split
 
 PERIOD_S, IDLE_PERIOD_S = 0.05, 1.0
 """Seconds between two looks for rows, at least and, while there are none, at most."""

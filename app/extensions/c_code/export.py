@@ -5,7 +5,7 @@ from __future__ import annotations
 from typing import TYPE_CHECKING
 
 from app.cli.prepare import attend, prepared
-from app.present.result import to_json
+from app.result import to_json
 from app.twin.log_reader import read_log
 from estimators.errors import ConfigError
 

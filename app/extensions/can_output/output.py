@@ -11,8 +11,8 @@ import struct
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from app.live.outputs import OutputLink
-from app.present.state_message import StateMessage
+from app.engine.copies import OutputLink
+from app.engine.outputs.state_message import StateMessage
 from app.twin.sources.kind import find_databases
 from config.source_schema import CanLogSection, CanSection
 from estimators.diagnostics.references import WITHHELD
@@ -20,7 +20,7 @@ from estimators.errors import ConfigError, printable
 from estimators.track import HEALTH_NAMES
 
 if TYPE_CHECKING:
-    from app.live.running_fold import Running
+    from app.engine.running_fold import Running
     from app.twin.secrets import Secrets
 
     from .schema import CanOutputSection

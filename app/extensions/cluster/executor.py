@@ -34,7 +34,7 @@ _kept: dict[str, Callable[..., Any]] = {}
 
 @contextmanager
 def folds_of(cluster: str, twin: Twin, held: Twin, name: str, overrides: Mapping[str, str]) -> Iterator[Executor]:
-    """Context manager: an Executor for the folds of a twin; see `app.studies.processes.executor_of`."""
+    """Context manager: an Executor for the folds of a twin; see `app.study.processes.executor_of`."""
     with dask(cluster, _load, (name, dict(overrides))) as workers:
         yield ClusterExecutor(workers, [*functions_of(twin.model), *functions_of(held.model)])
 

@@ -18,7 +18,7 @@ from typing import Any
 
 import numba
 
-from app.studies.processes import deaf
+from app.study.processes import deaf
 from estimators.errors import ConfigError, NisusError
 
 LOCAL = "local:"
@@ -76,7 +76,7 @@ class Cluster:
 
 @contextmanager
 def dask(address: str, begin: Callable[..., None], given: tuple[Any, ...]) -> Iterator[Cluster]:
-    """Context manager: the workers of a cluster; for the arguments and errors see `app.studies.processes.results`."""
+    """Context manager: the workers of a cluster; for the arguments and errors see `app.study.processes.results`."""
     try:
         from distributed import Client, LocalCluster
         from distributed.comm import connect

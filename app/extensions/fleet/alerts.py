@@ -11,10 +11,10 @@ from typing import Any
 import numpy as np
 from pydantic import BaseModel, ConfigDict, Field
 
+from app.engine.outputs.alarm_guide import advice
+from app.engine.outputs.alerts import FIRING, REPEATED, RESOLVED, SETTLE_S, AlertMessage, numbered
+from app.engine.outputs.state_message import iso_now
 from app.format_time import counted
-from app.outputs.alerts import FIRING, REPEATED, RESOLVED, SETTLE_S, AlertMessage, numbered
-from app.present.export.alarm_guide import advice
-from app.present.state_message import iso_now
 from estimators.diagnostics.detectors import anchor
 from estimators.errors import printable
 from estimators.fleet.table import FleetTable

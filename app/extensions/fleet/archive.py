@@ -17,8 +17,8 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from app.engine.jobs import LoopThread
 from app.extensions.archive.parts import DAY_NS, ArchivePlan, number_of, parts_of, remove_surplus
-from app.live.jobs import LoopThread
 from estimators.errors import SourceError
 from estimators.events.batch import KIND_NAMES, READING, Events
 from sources.source import Report

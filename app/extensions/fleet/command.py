@@ -18,11 +18,11 @@ from app.extensions.archive.parts import ArchivePlan
 from app.extensions.service.command import PRELOADED, door_of, run_child, serve_until_end
 from app.extensions.service.service import Service
 from app.extensions.service.supervisor import Supervisor
-from app.present.export.track_file import encoded
-from app.present.result import to_json, to_text
+from app.record.rrd_file import parse_split
+from app.render.track_file import encoded
+from app.result import to_json, to_text
 from app.terminal import complain, until_asked_to_end
 from app.twin.log_reader import remarking
-from app.views.recording.rrd_file import parse_split
 from config.yaml_files import writing
 from estimators.errors import ConfigError, NisusError, SourceError
 from estimators.fleet.table import FleetTable

@@ -7,10 +7,10 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from app.live.jobs import Jobs, LoopThread
-from app.live.notices import Notices
-from app.outputs.alert_store import AlertStore
-from app.outputs.receivers import Deliveries
+from app.engine.jobs import Jobs, LoopThread
+from app.engine.notices import Notices
+from app.engine.outputs.alert_store import AlertStore
+from app.engine.outputs.receivers import Deliveries
 from app.terminal import print_line
 from app.twin.secrets import secrets_of
 from estimators.fleet.table import FleetTable

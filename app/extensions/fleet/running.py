@@ -16,11 +16,11 @@ from typing import TYPE_CHECKING, Any, NamedTuple, Protocol
 
 import numpy as np
 
-from app.ingest import CLOCK_MOVED, clock_lines, refusal
-from app.live.fold_json import tuning_to_json
-from app.live.jobs import LoopThread
-from app.live.outcomes import Outcomes
-from app.live.store import RETRY_PERIOD_S, Store
+from app.engine.fold_json import tuning_to_json
+from app.engine.jobs import LoopThread
+from app.engine.outcomes import Outcomes
+from app.engine.store import RETRY_PERIOD_S, Store
+from app.twin.ingest import CLOCK_MOVED, clock_lines, refusal
 from app.twin.twin import Twin
 from estimators.errors import SourceError, is_blank, quoted, reason_of
 from estimators.events.clocks import ClockGuard

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from app.present.state_message import StateMessage, calendar_time, iso_now, number_or_none, published_state
+from app.engine.outputs.state_message import StateMessage, calendar_time, iso_now, number_or_none, published_state
 from app.twin.twin import Twin
 from estimators.diagnostics.references import HALF_WIDTH, WITHHELD, state_grades
 from estimators.fleet.table import FleetTable

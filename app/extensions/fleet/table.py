@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 
 from app.format_time import counted
-from app.present.result import Cell, TableColumn, Topic
+from app.result import Cell, TableColumn, Topic
 from estimators.fleet.siblings import MIN_ASSETS, Siblings, siblings
 from estimators.fleet.table import FleetTable
 from estimators.model.state_space import StateSpaceModel

@@ -8,10 +8,10 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from app.live.tunings.versions import now
-from app.present.result import Topic
-from app.present.runs_json import part_json
+from app.render.runs_json import part_json
+from app.result import Topic
 from app.twin.twin import Twin
+from app.twin.versions import now
 from config.yaml_files import as_flow, as_section, rounded
 from estimators.diagnostics.sensitivity.responses import digits
 from estimators.fit.judge import PartScore

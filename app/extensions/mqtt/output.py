@@ -7,18 +7,18 @@ import threading
 from collections.abc import Callable
 from typing import TYPE_CHECKING, Any, NamedTuple
 
-from app.live.outputs import OutputLink
-from app.outputs.alerts import AlertMessage
-from app.outputs.receivers import TIMEOUT_S
-from app.present.state_message import StateMessage, iso_now, state_schema
+from app.engine.copies import OutputLink
+from app.engine.outputs.alerts import AlertMessage
+from app.engine.outputs.receivers import TIMEOUT_S
+from app.engine.outputs.state_message import StateMessage, iso_now, state_schema
 from app.twin.secrets import Secrets
 from estimators.errors import printable
 
 from .client import mqtt_client
 
 if TYPE_CHECKING:
-    from app.live.notices import Notices
-    from app.live.running_fold import Running
+    from app.engine.notices import Notices
+    from app.engine.running_fold import Running
     from estimators.model.state_space import StateSpaceModel
 
     from .schema import MqttSection

@@ -10,15 +10,15 @@ from contextlib import suppress
 from datetime import UTC, datetime, timedelta
 from typing import TYPE_CHECKING, Any
 
-from app.live.outputs import OutputLink
-from app.present.state_message import StateMessage
+from app.engine.copies import OutputLink
+from app.engine.outputs.state_message import StateMessage
 from app.twin.secrets import Secrets
 from estimators.errors import ConfigError
 
 from .source import run_again
 
 if TYPE_CHECKING:
-    from app.live.running_fold import Running
+    from app.engine.running_fold import Running
 
     from .schema import OpcUaSection
 

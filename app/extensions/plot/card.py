@@ -14,8 +14,8 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from app.charts.colors import DEVIATION, ERROR, ESTIMATE, LIGHT, PictureKind, Scale, gradient, image_of
 from app.cli.prepare import prepare
-from app.present.drawing.colors import DEVIATION, ERROR, ESTIMATE, LIGHT, PictureKind, Scale, gradient, image_of
 from app.twin.log_reader import read_log
 from app.twin.twin import load_twin
 from app.web.gallery.cards import picture_file

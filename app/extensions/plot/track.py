@@ -11,11 +11,11 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 
-from app.present.drawing.colors import LIGHT, RGB
-from app.present.drawing.direct_readings import measured_by
-from app.present.series.chart_stream import drawn
-from app.present.series.columns import DOTS, columns_of, rows_of, units_by_name
-from app.present.series.levels_of_detail import grouped
+from app.charts.chart_stream import drawn
+from app.charts.colors import LIGHT, RGB
+from app.charts.direct_readings import measured_by
+from app.charts.levels_of_detail import grouped
+from app.columns import DOTS, columns_of, rows_of, units_by_name
 from estimators.diagnostics.episodes import Episode
 from estimators.errors import ConfigError
 from estimators.log import Events

@@ -17,8 +17,8 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple
 from urllib.parse import quote
 
+from app.record.rrd_file import NEVER, Split, parse_split
 from app.terminal import until_asked_to_end, use_lines_of_json, when_asked_to_end
-from app.views.recording.rrd_file import NEVER, Split, parse_split
 from app.web.door import LOOPBACK, Door, check_port
 from app.web.gate import NEEDS_TOKENS, Grant, grants_of
 from config.loader import shipped

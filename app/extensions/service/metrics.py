@@ -9,8 +9,8 @@ import numpy as np
 from starlette.responses import Response
 from starlette.routing import BaseRoute
 
-from app.live.running_fold import Running
-from app.present.state_message import state_message
+from app.engine.outputs.state_message import state_message
+from app.engine.running_fold import Running
 from app.web.http import get, refusal
 from estimators.errors import ConfigError
 from estimators.track import HEALTH_NAMES, VERDICT_NAMES

@@ -16,8 +16,8 @@ import uvicorn.protocols.websockets.auto  # noqa: F401
 from numba.core.registry import cpu_target
 
 from app.cli import open_twin
-from app.views.rerun import rows
-from app.views.viser import view
+from app.explore import rows
+from app.scene import view
 from app.web import server
 from config.schema import TwinSection
 from sources import pacer

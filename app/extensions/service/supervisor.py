@@ -14,7 +14,7 @@ from multiprocessing import forkserver
 from multiprocessing.connection import Connection, wait
 from typing import Any
 
-from app.live.jobs import LoopThread
+from app.engine.jobs import LoopThread
 from app.terminal import print_line
 from estimators.track import HEALTH_NAMES
 

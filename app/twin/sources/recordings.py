@@ -19,7 +19,7 @@ from sources.merged import MemorySource, Merged
 from sources.pieces import VALUES
 from sources.source import span_of
 
-from ...ingest import Ingest
+from ..ingest import Ingest
 from .can import CAN_LOG
 from .kind import Kind, Opening, blamed, closed, find_recording, matching
 

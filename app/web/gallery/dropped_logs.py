@@ -15,9 +15,9 @@ from estimators.errors import ConfigError, SourceError, quoted
 from sources.tables.times import SERIAL_DAYS, UNITS, TimeColumn
 from sources.worker_process import IsolatedReader
 
-from ...live.jobs import CANCELLED, CANCELLING, DONE, FAILED, RUNNING, Job
-from ...studies.advice.draft import check_new
-from ...studies.log_overview import DraftStep, LogOverview, draft, overview
+from ...engine.jobs import CANCELLED, CANCELLING, DONE, FAILED, RUNNING, Job
+from ...study.advice.draft import check_new
+from ...study.log_overview import DraftStep, LogOverview, draft, overview
 from ...twin.log_match import LogHeader, TwinMatch, match_log
 from ...twin.source import KEY, kind_of
 from ...twin.sources.kind import find_databases
@@ -25,7 +25,7 @@ from ..running import stamp_of
 from .cards import Card, readable_twins
 from .recordings import DATABASE, Recordings
 
-ROLES = ("states", "sensors", "inputs", "held_out")  # Fields of `app.studies.advice.plan.Roles`
+ROLES = ("states", "sensors", "inputs", "held_out")  # Fields of `app.study.advice.plan.Roles`
 
 JOB_TIMEOUT_S = 600.0  # Longest time between two items of a job; the page shows how long it has taken
 

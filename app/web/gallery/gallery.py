@@ -14,8 +14,8 @@ from config.loader import shipped, shown_path
 from config.tunings import OWN_VALUES
 from estimators.errors import ConfigError, NisusError, nearest, quoted
 
-from ...live.changes import obstacle
-from ...live.jobs import LoopThread
+from ...engine.jobs import LoopThread
+from ...twin.changes import obstacle
 from ...twin.twin import VERSION, Twin, with_version
 from ..running import OpenedTwin, RunningTwin, Stamp, stamp_of
 from ..session import Session

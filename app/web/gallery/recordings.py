@@ -15,10 +15,10 @@ from typing import TYPE_CHECKING, Any
 from estimators.errors import ConfigError, NisusError, quoted
 from sources.formats import CAN_LOGS, is_recording, tables
 
-from ...views.recording.rrd_file import Disk
+from ...record.rrd_file import Disk
 
 if TYPE_CHECKING:
-    from ...views.recording.reader import Facts
+    from ...record.reader import Facts
 
 RECORDING = ".rrd"
 
@@ -99,7 +99,7 @@ class Recordings:
             self._looking = True
 
         def look() -> None:
-            from ...views.recording.reader import facts_of
+            from ...record.reader import facts_of
 
             try:
                 for path, key in unknown:

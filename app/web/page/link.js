@@ -50,7 +50,7 @@ export class Link extends EventTarget {
     this.dispatchEvent(new CustomEvent(type, { detail }));
   }
 
-  // Ask for a chart stream (app/present/series/chart_stream.py) in place of the one of that name; null closes it.
+  // Ask for a chart stream (app/charts/chart_stream.py) in place of the one of that name; null closes it.
   look(name, wanted, take) {
     if (wanted === null) {
       delete this.streams[name];

@@ -1,4 +1,4 @@
-// The charts of an HTML report: the page's own, over data in the file (app/present/export/report_charts.py). On paper
+// The charts of an HTML report: the page's own, over data in the file (app/render/report_charts.py). On paper
 // each is an SVG drawing.
 
 import { Chart, declared, heading } from "./chart.js";

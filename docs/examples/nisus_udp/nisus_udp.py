@@ -59,7 +59,7 @@ class UdpOutput:
     name = "udp"
 
     def __init__(self, section, engine, secrets):
-        from app.live.outputs import OutputLink
+        from app.engine.copies import OutputLink
 
         self._address, self._socket = (section.host, section.port), socket.socket(type=socket.SOCK_DGRAM)
         self.link = lambda: OutputLink(True, f"{section.host}:{section.port}")

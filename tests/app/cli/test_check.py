@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from app.cli.main import main
-from app.present.result import Bar, Topic, to_html
+from app.result import Bar, Topic, to_html
 from estimators.diagnostics.sensitivity.responses import Nudge
 
 REQUIRED = {"checklist", "observability", "smallest_visible", "integrity", "held_out", "open_loop"}

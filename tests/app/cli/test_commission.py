@@ -9,10 +9,10 @@ import pytest
 from app.cli.arguments import CommissionCommand
 from app.cli.commission import commission_twin
 from app.cli.main import main
-from app.live.tunings.versions import write_section
-from app.studies.commission import lines
+from app.study.commission import lines
 from app.twin.log_reader import read_log
 from app.twin.twin import load_twin
+from app.twin.versions import write_section
 from estimators.diagnostics.episodes.baseline import Normal, baseline_of, lost_from
 from estimators.errors import ConfigError
 from estimators.fold import fold

@@ -10,9 +10,9 @@ import pytest
 from pyarrow import csv as pa_csv
 
 import app.cli.compare
-import app.studies.compare
-from app.studies.compare import fold_row, tidy, within
-from app.studies.scores import SCORES, FilterScore, Spread, cells, printed, read_scores, scores_file, write_scores
+import app.study.compare
+from app.study.compare import fold_row, tidy, within
+from app.study.scores import SCORES, FilterScore, Spread, cells, printed, read_scores, scores_file, write_scores
 from app.twin.log_reader import read_log
 from app.twin.twin import load_twin
 from config.loader import load, shipped
@@ -216,7 +216,7 @@ def test_a_slow_filter_folds_a_stated_span(monkeypatch):
         return count
 
     monkeypatch.setattr(Fold, "advance", counted)
-    monkeypatch.setattr(app.studies.compare.time, "process_time", lambda: 1e-4 * stepped)
+    monkeypatch.setattr(app.study.compare.time, "process_time", lambda: 1e-4 * stepped)
     row = fold_row(twin, "filterpy-ekf", [events], budget=0.06)
     assert row.span == tidy((events.t[599] - events.t[0]) * 1e-9)
     assert row.seconds_per_step == pytest.approx(1e-4)
@@ -258,7 +258,7 @@ def test_all_twins_in_turn_and_those_without_a_recording_are_named(monkeypatch, 
     source = "source: {type: table, files: no.csv, time: {column: t}, sensors: {winding: {columns: w}}}\n"
     bad.write_text(f"model: motor_winding\nestimator: kf\n{source}", encoding="utf-8")
     monkeypatch.setattr(app.cli.compare, "shipped", lambda: [str(bad), str(good)])
-    monkeypatch.setattr(app.studies.compare, "ESTIMATORS", {"kf": ESTIMATORS["kf"]})
+    monkeypatch.setattr(app.study.compare, "ESTIMATORS", {"kf": ESTIMATORS["kf"]})
     assert "no.csv" in nisus.refuses("compare", "all", "--write")
     (line,) = read_scores(good)
     assert line["filter"] == "kf" and line["events"] == "21"

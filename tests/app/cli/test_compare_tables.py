@@ -8,8 +8,8 @@ from typing import NamedTuple
 import numpy as np
 import pytest
 
-from app.studies.compare import able, draws, outcome_of, timed, within, without_marks
-from app.studies.scores import COST, SPAN, read_scores, spread
+from app.study.compare import able, draws, outcome_of, timed, within, without_marks
+from app.study.scores import COST, SPAN, read_scores, spread
 from app.twin.log_reader import read_log
 from app.twin.twin import load_twin
 from config.loader import shipped

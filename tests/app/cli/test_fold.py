@@ -9,9 +9,9 @@ import pyarrow.parquet as pq
 import pytest
 from rerun.chunk import RrdReader
 
-from app.present.result import to_text
-from app.studies.compare import fold_row
-from app.studies.fold_result import ExplainedEpisode, dropped, episodes_topic
+from app.result import to_text
+from app.study.compare import fold_row
+from app.study.fold_result import ExplainedEpisode, dropped, episodes_topic
 from app.twin.log_reader import read_log
 from app.twin.twin import load_twin
 from estimators.diagnostics.episodes import Episode
@@ -21,7 +21,7 @@ from estimators.interface.by_name import fold as fold_by_name
 from estimators.models import MODELS
 from estimators.track import HEALTH_NAMES
 from estimators.tuning import Tuning
-from tests.app.present.export.test_report import data_of
+from tests.app.render.test_report import data_of
 from tests.cases import cases
 from tests.support import measured
 

@@ -2,7 +2,7 @@
 
 from app.cli.arguments import FoldCommand
 from app.cli.fold import fold_twin
-from app.present.export.calibration_lines import calibration_lines, coverage_rows
+from app.study.calibration_lines import calibration_lines, coverage_rows
 from app.twin.twin import load_twin
 from estimators.diagnostics.calibration import Calibration, CoverageBin
 from estimators.diagnostics.intervals import UNKNOWN, Interval

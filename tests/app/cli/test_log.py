@@ -4,7 +4,7 @@ import can
 import numpy as np
 import pytest
 
-from app.studies.advice.signals import noise_of
+from app.study.advice.signals import noise_of
 from app.twin.twin import load_twin
 from sources.inspect import SignalSeries
 from tests.cases import cases

@@ -8,11 +8,11 @@ import numpy as np
 import pytest
 
 from app.cli.open_twin import opened_review, opened_twin, recorded_twin
-from app.live.notices import Annotation
+from app.engine.notices import Annotation
+from app.record.reader import read_recording
+from app.record.writer import write_recording
 from app.twin.log_reader import remarking
 from app.twin.twin import load_twin
-from app.views.recording.reader import read_recording
-from app.views.recording.writer import write_recording
 from app.web.session import Session
 from config.loader import load
 from estimators.diagnostics.episodes import episodes
@@ -113,7 +113,7 @@ import sys
 sys.path.insert(0, {root!r})
 from pathlib import Path
 from app.cli.open_twin import live_source
-from app.live.commands import Annotate, DeleteAnnotation, Record
+from app.engine.commands import Annotate, DeleteAnnotation, Record
 from app.twin.twin import load_twin
 from app.web.running import OpenedTwin
 from app.web.session import Session

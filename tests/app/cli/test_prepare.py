@@ -8,7 +8,7 @@ import pytest
 
 import app.cli.prepare
 from app.cli.prepare import attend
-from app.live.watchdog import CALL_TIMEOUT_S, CallWatch
+from app.engine.watchdog import CALL_TIMEOUT_S, CallWatch
 from tests.models import level_model
 from tests.waiting import LIMIT_S, wait_for
 

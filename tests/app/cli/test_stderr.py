@@ -5,7 +5,7 @@ import pytest
 import app.cli.open_twin
 import app.cli.prepare
 from app.cli.main import main
-from app.live.workshop import Workshop
+from app.engine.workshop import Workshop
 from app.terminal import printable
 from tests.app.cli.test_fold import DRIVE, ROWS
 

@@ -5,7 +5,7 @@ import yaml
 
 from app.twin.defaults import natural_aim
 from app.twin.twin import load_twin
-from tests.app.live.tunings.test_versions import pasted_text
+from tests.app.twin.test_versions import pasted_text
 
 TUNE = "tune", "motor_winding"
 SHORT = "--set", "source.duration=300"

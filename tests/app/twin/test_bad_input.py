@@ -7,8 +7,8 @@ import numpy as np
 import pytest
 
 from app.cli.main import main
-from app.live import commands
-from app.live.execute import playback
+from app.engine import commands
+from app.engine.execute import playback
 from app.twin.twin import load_twin, restore_twin
 from app.web.commands_json import command_from_json
 from estimators.compiled.model import compile_model

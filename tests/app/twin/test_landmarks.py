@@ -7,11 +7,11 @@ import numpy as np
 import pytest
 
 from app.cli.prepare import fold_log, prepare
-from app.live.changes import difference
-from app.live.tunings.tuning_yaml import tuning_yaml
-from app.present.export.calibration_lines import calibration_lines
-from app.studies.fold_result import calibration_of
+from app.study.calibration_lines import calibration_lines
+from app.study.fold_result import calibration_of
+from app.twin.changes import difference
 from app.twin.log_reader import read_log
+from app.twin.tuning_yaml import tuning_yaml
 from app.twin.twin import load_twin
 from estimators import Log, fold
 from estimators.errors import EstimatorError, ModelError, NisusError

@@ -10,9 +10,9 @@ import pytest
 
 from app.cli.arguments import FoldCommand as Arguments
 from app.cli.fold import fold_twin
-from app.live.alerts import rejections
-from app.live.counts import RowCounts
-from app.live.fold_json import base_from_json, base_to_json
+from app.engine.counts import RowCounts
+from app.engine.failure_notices import rejections
+from app.engine.fold_json import base_from_json, base_to_json
 from app.twin.model import configure
 from app.twin.twin import load_twin
 from estimators.errors import ConfigError

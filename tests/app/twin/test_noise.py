@@ -9,12 +9,12 @@ import pytest
 
 from app.cli.arguments import FoldCommand as Arguments
 from app.cli.fold import fold_twin
-from app.live.commands import SetEstimator, SetOption
-from app.live.execute import retuned
-from app.live.fold_json import tuning_from_json
+from app.engine.commands import SetEstimator, SetOption
+from app.engine.execute import retuned
+from app.engine.fold_json import tuning_from_json
+from app.record.reader import read_recording
 from app.twin.log_reader import read_log
 from app.twin.twin import restore_twin
-from app.views.recording.reader import read_recording
 from estimators.errors import ConfigError, EstimatorError
 from estimators.fold import fold
 from estimators.log import READING, TRUTH, Log

@@ -7,7 +7,7 @@ import pytest
 
 from app.cli.arguments import FoldCommand
 from app.cli.fold import fold_twin
-from app.ingest import Ingest
+from app.twin.ingest import Ingest
 from app.twin.log_reader import read_log
 from app.twin.twin import load_twin
 from estimators.errors import ConfigError

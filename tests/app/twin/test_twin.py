@@ -6,7 +6,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from app.live.tunings.tuning_yaml import tuning_yaml
+from app.twin.tuning_yaml import tuning_yaml
 from app.twin.twin import load_twin, restore_twin
 from config import extensions
 from config.loader import TWINS

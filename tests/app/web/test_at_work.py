@@ -10,9 +10,9 @@ import numpy as np
 import pytest
 from websockets.sync.client import connect
 
-import app.live.watchdog
-from app.live.commands import SetTuning
-from app.live.engine import Engine
+import app.engine.watchdog
+from app.engine.commands import SetTuning
+from app.engine.engine import Engine
 from app.web.server import PageServer
 from tests.app.scripted import Scripted, readings, row_count, solved_by, twin
 from tests.app.served import SECRET, Client
@@ -50,7 +50,7 @@ def running(monkeypatch, tmp_path):
     monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
     monkeypatch.setattr("app.web.server.viewer_assets", lambda progress: tmp_path)
     # Nobody gives the solver up.
-    monkeypatch.setattr(app.live.watchdog, "CHECK_AFTER_S", float("inf"))
+    monkeypatch.setattr(app.engine.watchdog, "CHECK_AFTER_S", float("inf"))
     solver, source = Solver(), Scripted()
     engine = Engine(twin(model=solved_by(solver.called), estimator="filterpy-ukf"), lambda report: source)
     server = PageServer(engine, port=0, viser_port=None, secret=SECRET)

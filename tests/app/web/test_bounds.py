@@ -15,7 +15,7 @@ import pytest
 from starlette.responses import PlainTextResponse
 from websockets.exceptions import ConnectionClosed, InvalidStatus
 
-from app.views.viser import guarded_server as private_viser
+from app.scene import guarded_server as private_viser
 from app.web import door
 from app.web.door import MAX_CONNECTIONS as CONNECTIONS
 from app.web.gate import Grant

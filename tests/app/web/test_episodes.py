@@ -7,7 +7,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from app.live.engine import Engine
+from app.engine.engine import Engine
 from app.web.twin_json import episodes_json, status_json
 from tests.app.scripted import Scripted, readings, twin
 from tests.waiting import LIMIT_S, wait_for

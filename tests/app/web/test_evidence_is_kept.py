@@ -6,9 +6,9 @@ import numpy as np
 import pytest
 
 from app.cli.open_twin import live_source
-from app.live.commands import Annotate, SetTuning
-from app.present.export.report import Reported, report
-from app.present.export.track_file import rows_of_run
+from app.engine.commands import Annotate, SetTuning
+from app.render.report import Reported, report
+from app.render.track_file import rows_of_run
 from app.twin.twin import load_twin
 from app.web.running import OpenedTwin
 from app.web.session import Session

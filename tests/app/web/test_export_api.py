@@ -10,8 +10,8 @@ import pytest
 
 from app.cli.arguments import FoldCommand
 from app.cli.fold import fold_twin
-from app.live.commands import Load, Maintenance, SetTuning
-from app.present.export import track_file
+from app.engine.commands import Load, Maintenance, SetTuning
+from app.render import track_file
 from tests.app.cli.test_check import ParsedHtml
 from tests.app.scripted import pull_all
 from tests.app.served import Client

@@ -7,7 +7,7 @@ import shutil
 import pyarrow.parquet as pq
 import pytest
 
-from app.live.execute import retuned
+from app.engine.execute import retuned
 from app.twin.twin import load_twin
 from app.web.commands_json import command_from_json
 from config.loader import TWINS

@@ -9,10 +9,10 @@ import typing
 import pytest
 from starlette.requests import Request
 
-from app.live import commands
-from app.live.engine import Engine
-from app.present.series.chart_stream import ChartQuery, ChartStream
-from app.present.series.columns import columns_of
+from app.charts.chart_stream import ChartQuery, ChartStream
+from app.columns import columns_of
+from app.engine import commands
+from app.engine.engine import Engine
 from app.twin.twin import load_twin
 from app.web.commands_json import command_from_json
 from app.web.http import get, parse, post

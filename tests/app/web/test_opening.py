@@ -16,7 +16,7 @@ import pytest
 import app.cli.open_twin
 import app.cli.run
 from app.cli.main import main
-from app.live.engine import Engine
+from app.engine.engine import Engine
 from app.web import session as session_module
 from app.web.door import FormerSessions, check_port
 from app.web.server import PageServer
@@ -47,7 +47,7 @@ def taken():
 
 @pytest.mark.parametrize("command", ["run", "review"])
 def test_a_port_in_use_is_reported_before_anything_is_compiled(command, taken, monkeypatch, capsys):
-    for place in ("app.cli.open_twin.begin_to_compile", "app.views.recording.reader.read_recording"):
+    for place in ("app.cli.open_twin.begin_to_compile", "app.record.reader.read_recording"):
         monkeypatch.setattr(place, lambda *_: pytest.fail("it went on"))
     assert main([command, "motor_winding", "--port", str(taken), "--no-browser"]) == 2
     assert re.fullmatch(rf"nisus: port {taken}: .* in use; .*--port\n", capsys.readouterr().err)

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 import yaml
 
-from app.live.commands import SetTuning
+from app.engine.commands import SetTuning
 from app.twin.twin import load_twin
 from config.loader import TWINS
 from estimators.tuning import Tuning

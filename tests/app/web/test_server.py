@@ -10,7 +10,7 @@ from pathlib import Path
 
 import pytest
 
-from app.live.engine import Engine
+from app.engine.engine import Engine
 from app.web import viewer_assets as assets_module
 from app.web.gate import USER, Gate, read_tokens
 from app.web.server import PageServer

@@ -12,7 +12,7 @@ import pytest
 from pydantic import ValidationError
 from starlette.routing import Route
 
-from app.present.state_message import PublishedState, StateMessage, _input, state_message, state_schema
+from app.engine.outputs.state_message import PublishedState, StateMessage, _input, state_message, state_schema
 from app.web.http import ApiRoute
 from estimators import Input, fuse
 from estimators.track import DEGRADED, DIVERGED, HEALTH_NAMES, STALE, SUSPECT, TRACKING, WAITING

@@ -27,8 +27,8 @@ import json
 from types import SimpleNamespace
 import numpy as np
 from app.leading import leading
-from app.live.episode_log import EpisodeSummary
-from app.present.export.report import episode_topic
+from app.engine.episode_log import EpisodeSummary
+from app.render.report import episode_topic
 from app.web.twin_json import episodes_json
 from estimators.diagnostics.detector_state import sensor_states
 from estimators.diagnostics.detectors import ALARM_NAMES, detector_of

@@ -9,14 +9,14 @@ from types import SimpleNamespace
 
 import pytest
 
+from app.engine.outputs.alerts import heartbeat
+from app.engine.outputs.receivers import Delivery
 from app.extensions.alerts import mail
 from app.extensions.alerts.command import CommandReceiver
 from app.extensions.alerts.mail import Mail
 from app.extensions.alerts.schema import CommandSection, EmailSection
-from app.outputs.alerts import heartbeat
-from app.outputs.receivers import Delivery
-from tests.app.outputs.pushed import push
-from tests.app.outputs.test_alerts import assert_fails, publishing
+from tests.app.engine.outputs.pushed import push
+from tests.app.engine.outputs.test_alerts import assert_fails, publishing
 from tests.waiting import LIMIT_S, wait_for
 
 

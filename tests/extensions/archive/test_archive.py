@@ -14,13 +14,13 @@ import pytest
 
 from app.cli.main import main
 from app.cli.open_twin import live_source
+from app.engine.commands import SetTuning
 from app.extensions.archive import parts as archives
 from app.extensions.archive.parts import parts_of
 from app.extensions.archive.writer import archive_of
-from app.live.commands import SetTuning
+from app.record.rrd_file import Split, parse_split
 from app.twin.twin import load_twin
-from app.views.recording.rrd_file import Split, parse_split
-from tests.app.live.test_store import Session as StoredSession
+from tests.app.engine.test_store import Session as StoredSession
 from tests.app.scripted import random_walk, readings
 from tests.cases import cases
 

@@ -13,10 +13,10 @@ import pytest
 
 from app.extensions.cluster import executor as module
 from app.extensions.cluster.executor import ClusterExecutor, functions_of, packed, unpacked
-from app.present.result import to_json
-from app.studies.check import check, figures
-from app.studies.checklist import checklist
-from app.studies.processes import executor_of
+from app.result import to_json
+from app.study.check import check, figures
+from app.study.checklist import checklist
+from app.study.processes import executor_of
 from app.twin.log_reader import read_log
 from app.twin.twin import load_twin, with_held
 from estimators.errors import ConfigError
@@ -24,7 +24,7 @@ from estimators.fit.fit import fit
 from estimators.fit.objective import Cancelled
 from estimators.fit.recording import Recording
 from tests import ROOT
-from tests.app.studies.test_processes import bits
+from tests.app.study.test_processes import bits
 from tests.waiting import LIMIT_S
 
 NAME, OVERRIDES = "motor_winding", {"R.winding": "0.2"}

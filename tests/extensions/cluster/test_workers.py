@@ -9,9 +9,9 @@ from importlib.metadata import PackageNotFoundError, version
 import pytest
 
 from app.extensions.cluster import workers
-from app.studies.processes import results
+from app.study.processes import results
 from estimators.errors import ConfigError
-from tests.app.studies.test_processes import begin, double, handled
+from tests.app.study.test_processes import begin, double, handled
 from tests.cases import cases
 from tests.extensions.cluster.conftest import started
 from tests.waiting import wait_for

@@ -6,18 +6,18 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
+from app.engine.outputs.alerts import SETTLE_S, AlertRules
 from app.extensions.fleet.alerts import MAX_ABSENCE_S, MAX_LISTED, FleetRules
 from app.extensions.fleet.publisher import FleetPublisher
 from app.extensions.fleet.schema import FleetAlertSection
-from app.outputs.alerts import SETTLE_S, AlertRules
 from app.web.readings import messages_of
 from config.output_schema import AlertSection
 from estimators.errors import ConfigError
 from estimators.fleet.fleet import Fleet
 from estimators.models import MODELS
 from estimators.track import HEALTH_NAMES
-from tests.app.outputs.test_alert_store import restarted
-from tests.app.outputs.test_alerts import state
+from tests.app.engine.outputs.test_alert_store import restarted
+from tests.app.engine.outputs.test_alerts import state
 from tests.cases import cases
 from tests.extensions.fleet.test_running import fleet_of, running
 from tests.support import error_of

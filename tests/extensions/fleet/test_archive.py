@@ -13,8 +13,8 @@ from app.extensions.fleet import running as live
 from app.extensions.fleet.archive import AssetHistory, FleetArchive
 from app.extensions.fleet.plan import load_fleet
 from app.extensions.fleet.running import RunningFleet
+from app.record.rrd_file import Split, parse_split
 from app.twin.twin import load_twin
-from app.views.recording.rrd_file import Split, parse_split
 from app.web.readings import messages_of
 from estimators.log import Log
 from tests.extensions.fleet.written_archive import BEGIN, SECOND, SPLIT, Written

@@ -6,9 +6,9 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
+from app.engine.outputs.state_message import StateMessage
 from app.extensions.fleet.publisher import FleetPublisher
 from app.extensions.fleet.state import ChangedAssets, asset_message
-from app.present.state_message import StateMessage
 from app.twin.twin import load_twin
 from app.web.readings import messages_of
 from estimators.track import HEALTH_NAMES

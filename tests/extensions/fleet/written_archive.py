@@ -7,8 +7,8 @@ import pyarrow.parquet as pq
 from app.extensions.archive.parts import ArchivePlan, parts_of
 from app.extensions.fleet.archive import FleetArchive
 from app.extensions.fleet.journal import read_journal
+from app.record.rrd_file import parse_split
 from app.twin.twin import load_twin
-from app.views.recording.rrd_file import parse_split
 from estimators.log import READING, Events
 
 BEGIN, SECOND = 1_767_225_600 * 10**9, 10**9

@@ -30,9 +30,9 @@ from app.extensions.lab.guard.baseline import (
 )
 from app.extensions.lab.guard.command import guard
 from app.extensions.lab.guard.suite import GuardVerdict, keep_last, of_twin
-from app.live.tunings.versions import Settings, accept, keep, verdicts, version_text
 from app.twin.log_reader import read_log
 from app.twin.twin import load_twin
+from app.twin.versions import Settings, accept, keep, verdicts, version_text
 from config.loader import TWINS, shipped
 from config.tunings import load_version
 from estimators.diagnostics.score import score

@@ -8,14 +8,14 @@ import pytest
 from paho.mqtt.packettypes import PacketTypes
 from paho.mqtt.reasoncodes import ReasonCode
 
+from app.engine.outputs.publisher import Publisher
+from app.engine.outputs.state_message import state_schema
 from app.extensions.mqtt.source import MqttSource, TopicMap
-from app.outputs import Publisher
-from app.present.state_message import state_schema
 from app.twin.twin import load_twin
 from estimators.errors import ConfigError
 from sources.messages import Messages
 from sources.source import Channel, ignore
-from tests.app.outputs.pushed import BEGIN, push, pushed_twin
+from tests.app.engine.outputs.pushed import BEGIN, push, pushed_twin
 from tests.app.scripted import notice_texts
 from tests.cases import cases
 from tests.extensions.mqtt.broker import Listener

@@ -10,10 +10,10 @@ import numpy as np
 import pytest
 from PIL import Image
 
+from app.charts.colors import ESTIMATE, LIGHT, Scale, gradient
 from app.cli.main import main
 from app.extensions.plot import card
 from app.extensions.plot.track import TrackSeries, draw_state, hex_color, new_figure, plot_track, plotter, time_unit
-from app.present.drawing.colors import ESTIMATE, LIGHT, Scale, gradient
 from estimators import MODELS, Log, fold
 from estimators.errors import ConfigError
 from estimators.track import USED

@@ -8,7 +8,7 @@ import pyarrow.parquet as pq
 from rosbags.rosbag2 import Reader
 from rosbags.typesys import Stores, get_typestore
 
-from app.studies.log_overview import overview
+from app.study.log_overview import overview
 from app.twin.log_reader import read_log
 from app.twin.twin import load_twin
 from sources.worker_process import read_isolated

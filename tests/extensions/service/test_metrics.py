@@ -7,8 +7,8 @@ from pathlib import Path
 
 from prometheus_client.parser import text_string_to_metric_families
 
-from tests.app.outputs.pushed import push
-from tests.app.outputs.test_alerts import DEAD, publishing
+from tests.app.engine.outputs.pushed import push
+from tests.app.engine.outputs.test_alerts import DEAD, publishing
 from tests.app.web.test_state_api import page, state
 from tests.waiting import wait_for
 

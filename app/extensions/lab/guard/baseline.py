@@ -32,8 +32,8 @@ from typing import NamedTuple
 import numpy as np
 from scipy.special import stdtrit
 
-from app.live.tunings.versions import COVERAGE, REFUSED, badness, figures
-from app.studies.scores import pictures_of
+from app.study.scores import pictures_of
+from app.twin.versions import COVERAGE, REFUSED, badness, figures
 from config.problems import check_section
 from config.yaml_files import as_flow, read_text, rounded, writing
 from estimators.diagnostics.score import score

@@ -12,12 +12,12 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
-from app.live.tunings.versions import COVERAGE, RMSE, VERDICT_FILE, now, verdicts
-from app.present.result import Topic
-from app.studies.compare import draws, tidy, within
-from app.studies.processes import results
+from app.result import Topic
+from app.study.compare import draws, tidy, within
+from app.study.processes import results
 from app.twin.log_reader import read_log
 from app.twin.twin import Twin, load_twin, restore_twin
+from app.twin.versions import COVERAGE, RMSE, VERDICT_FILE, now, verdicts
 from config.companion_schema import AcceptedSection
 from config.loader import find, shipped
 from config.source_schema import SimulatorSection
@@ -119,7 +119,7 @@ def of_folder(folder: Path) -> list[GuardedLog]:
 def _of_recording(path: Path) -> GuardedLog:
     own = path.with_name(f"{path.stem}{SUFFIX}")
     try:
-        from app.views.recording.reader import read_recording
+        from app.record.reader import read_recording
 
         twin = read_recording(path).twin_path
     except SourceError as error:
@@ -189,7 +189,7 @@ def twin_of(guarded: GuardedLog, overrides: dict[str, str] | None = None) -> Twi
     given = {**(overrides or {}), "tuning": OWN_VALUES if version is None else str(version.path)}
     if guarded.recording is None:
         return load_twin(guarded.twin, overrides=given)
-    from app.views.recording.reader import read_recording
+    from app.record.reader import read_recording
 
     recorded = read_recording(guarded.recording)
     own = {key: value for key, value in recorded.overrides.items() if key != "tuning"}
@@ -218,7 +218,7 @@ def logs_of(guarded: GuardedLog, twin: Twin, span: float | None) -> Iterator[tup
         SourceError: If a recording is missing or cannot be read.
     """
     if guarded.recording is not None:
-        from app.views.recording.reader import read_recording
+        from app.record.reader import read_recording
 
         recorded = read_recording(guarded.recording)
         yield Log.resume(twin.model, None, within(recorded.events, span)), recorded.base_for(twin.model)[0]

@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING
 
 from app.cli.options import overrides_of
 from app.cli.prepare import opened, prepare, progress
-from app.present.result import to_json, to_text
+from app.result import to_json, to_text
 from app.terminal import complain
 from estimators.errors import ConfigError
 from estimators.registry import find_estimator

@@ -7,7 +7,7 @@ from collections.abc import Mapping, Sequence
 
 import numpy as np
 
-from app.present.result import Cell, TableColumn, Topic
+from app.result import Cell, TableColumn, Topic
 
 from .detection import CHANCE, FALSE, INVISIBLE, MISNAMED, MISSED, NAMED, UNSEEN, Trial
 from .scenario import Mistake

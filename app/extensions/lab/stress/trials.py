@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 
-from app.studies.processes import results
+from app.study.processes import results
 from app.twin.twin import Twin, load_twin
 from estimators.errors import NisusError
 

@@ -8,8 +8,8 @@ import numpy as np
 import pytest
 
 from app.cli.main import main
-from app.live.commands import Record
-from app.views.recording.reader import facts_of, read_recording
+from app.engine.commands import Record
+from app.record.reader import facts_of, read_recording
 from app.web.gallery.recordings import Recordings
 from estimators.errors import ConfigError, SourceError
 from estimators.track import USED

@@ -6,10 +6,10 @@ from unittest.mock import Mock
 import numpy as np
 import pytest
 
-from app.live.changes import merged, obstacle
-from app.live.commands import SetEstimator, SetTuning
+from app.engine.commands import SetEstimator, SetTuning
+from app.record.reader import read_recording
+from app.twin.changes import merged, obstacle
 from app.twin.twin import load_twin
-from app.views.recording.reader import read_recording
 from app.web.gallery.gallery import SavedFiles
 from app.web.running import stamp_of
 from estimators.model.user_file import imported_beside

@@ -6,8 +6,8 @@ Those of a family, one for each landmark, have one slider and one switch.
 import numpy as np
 import pytest
 
-from app.live.outputs import Cursor
-from app.live.runs.sweep import Sweeps, noise
+from app.derive.sweep import Sweeps, noise
+from app.engine.copies import Cursor
 from tests.app.twin.test_landmarks import LANDMARKS, folder  # noqa: F401  a fixture
 from tests.app.web.page.browsed import running, settled, until
 from tests.models import write_plant

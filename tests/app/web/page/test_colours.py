@@ -12,8 +12,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from app.present.drawing.colors import THEMES as PALETTES
-from app.present.drawing.colors import mixed
+from app.charts.colors import THEMES as PALETTES
+from app.charts.colors import mixed
 
 STYLE = Path("app/web/page/chart.css").read_text()
 TEXT, GRAPHIC = 4.5, 3.0

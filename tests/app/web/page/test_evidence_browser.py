@@ -7,7 +7,7 @@ from contextlib import ExitStack
 import numpy as np
 import pytest
 
-from app.live.commands import SetTuning
+from app.engine.commands import SetTuning
 from tests.app.scripted import pull_all
 from tests.app.web.page.browsed import running, until
 from tests.app.web.page.test_quiet_browser import streams

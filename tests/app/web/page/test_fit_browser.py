@@ -5,8 +5,8 @@ import re
 
 import pytest
 
-from app.live.tunings.versions import listing
 from app.twin.twin import with_version
+from app.twin.versions import listing
 from tests.app.served import VERDICT, keep_verdicts
 from tests.app.web.page.browsed import running, settled
 from tests.waiting import LIMIT_S, wait_for

@@ -7,8 +7,8 @@ import pytest
 
 from app.cli.arguments import CommissionCommand
 from app.cli.commission import commission_twin
-from app.live.commands import Load, Record, SetTuning
-from app.views.recording.reader import read_recording
+from app.engine.commands import Load, Record, SetTuning
+from app.record.reader import read_recording
 from estimators.track import TRACKING
 from tests.app.scripted import pull_all
 from tests.app.web.gallery.opened import opened

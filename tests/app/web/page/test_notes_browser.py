@@ -109,7 +109,7 @@ def test_a_note_is_written_at_a_moment_and_every_browser_has_it(visit, session):
 
 
 def test_a_link_to_the_moment_of_a_note_and_the_report_show_it(visit, session, tmp_path):
-    from app.live.commands import Annotate
+    from app.engine.commands import Annotate
 
     engine, page = session.engine, visit(session.url)
     first = engine.span()[0] * 1e-9

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from app.cli.run import open_review
-from app.views.recording.reader import read_recording
+from app.record.reader import read_recording
 from app.web.session import Page
 from tests.app.scripted import pull_all
 from tests.app.web.page.browsed import drawn, running, settled, until

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from app.live.commands import Pin, SetTuning, UseSensor
+from app.engine.commands import Pin, SetTuning, UseSensor
 from estimators.attribution import attribution
 from estimators.fold import Fold
 from estimators.log import READING

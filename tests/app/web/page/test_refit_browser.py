@@ -2,8 +2,8 @@
 
 import pytest
 
-from app.live.runs.refits import Refits
-from app.live.tunings.versions import listing
+from app.derive.refits import Refits
+from app.twin.versions import listing
 from tests.app.web.page.browsed import running, settled
 from tests.app.web.page.test_fit_browser import TRUE, WRONG
 from tests.waiting import wait_for

@@ -23,7 +23,7 @@ def page(visit, session):
 
 def asked(session):
     """The queries of the browsers' sockets, as Viser's server knows them."""
-    from app.views.viser.guarded_server import addresses
+    from app.scene.guarded_server import addresses
 
     return sorted(addresses(session.running.view.server))
 

@@ -7,8 +7,8 @@ import subprocess
 import numpy as np
 import pytest
 
-from app.live.commands import Record
-from app.views.recording.reader import read_recording
+from app.engine.commands import Record
+from app.record.reader import read_recording
 from estimators.log import READING
 from tests.app.web.page.browsed import running
 from tests.chromium import FLAGS

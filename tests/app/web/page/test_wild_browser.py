@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from app.studies.analysis.forecast import Forecasts, question_from_json
+from app.derive.forecast import Forecasts, question_from_json
 from app.web.streams import belief_json
 from estimators.log import READING
 from tests.app.scripted import pull_all

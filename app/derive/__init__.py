@@ -1,0 +1,1 @@
+"""Folds beside the running one: pinned, smoothed, sweeps, refits, causes, forecasts."""

@@ -1,0 +1,1 @@
+"""The running twin: intake of events, fold, commands, status, background jobs, store and outputs."""

@@ -1,0 +1,96 @@
+"""Copy the history of a running twin in chunks, without holding the engine's lock for long."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import replace
+
+import numpy as np
+
+from estimators.errors import ConfigError
+from estimators.log import READING, Events, Log
+from estimators.snapshots import Base
+from estimators.track import Track
+from estimators.tuning import Tuning
+
+from .copies import Cursor, Pull
+from .running_fold import Running
+
+COPY_EVENTS = 4096
+"""Events that are copied at once."""
+
+
+def copy_log(
+    engine: Running, tuning: Tuning, most: int | None = None, check: Callable[[], None] = lambda: None
+) -> tuple[Log, Base | None]:
+    """Copy the events, with the base of a fold of them; None for the prior.
+
+    Args:
+        engine: The running twin.
+        tuning: The tuning of its fold.
+        most: Events, the last ones; a few more, since a fold starts at a snapshot. None for all.
+        check: Called before each chunk; may raise to end the copy.
+
+    Raises:
+        ConfigError: If another tuning took over meanwhile, or no reading has come.
+    """
+    end = engine.end()
+    at, base = engine.origin(0 if most is None else max(0, end - most))
+    pieces = []
+    for start in range(at, end, COPY_EVENTS):
+        check()
+        pull = engine.rows(start, min(start + COPY_EVENTS, end))
+        if pull.settings is None or pull.settings[0] is not tuning or pull.first != start:
+            raise ConfigError("the history changed while it was copied; try again")
+        pieces.append(pull.events)
+    events = Events.concat(pieces, engine.model.width)
+    log = Log.resume(engine.model, base, events)
+    if not (log.events.kind == READING).any():
+        raise ConfigError("no reading has come yet; there is nothing to fold")
+    return log, base
+
+
+COPY_ROWS = 16_384
+"""Rows copied at once."""
+
+
+def copy_rows(engine: Running) -> Pull | None:
+    """Copy all rows; None while there are none."""
+    cursor = engine.cursor()
+    try:
+        found = pull_rest(engine, cursor, engine.pull(cursor, COPY_ROWS), COPY_ROWS)
+    finally:
+        engine.release(cursor)
+    return found if len(found.events) else None
+
+
+def last_written(index: np.ndarray) -> np.ndarray:
+    """Return which rows, by index in the order of writing (n,), are valid: one written again cuts off later ones."""
+    later = np.minimum.accumulate(index[::-1])[::-1]
+    return np.append(index[:-1] < later[1:], np.ones(min(1, index.size), bool))
+
+
+def pull_rest(engine: Running, cursor: Cursor, pull: Pull, size: int) -> Pull:
+    """Return a fresh pull of `size` rows joined with all rows after it.
+
+    If another revision begins meanwhile its rows are returned; rows that a late measurement rewrote are the later ones.
+    Notices are those of all pulls.
+    """
+    parts, notices = [pull], list(pull.notices)
+    while len(parts[-1].events) == size:
+        more = engine.pull(cursor, size)
+        notices += more.notices
+        parts = [more] if more.fresh else [*parts, more]
+    first = parts[0].first
+    events = Events.concat([part.events for part in parts], engine.model.width)
+    columns = zip(*(part.track for part in parts), strict=True)
+    track = Track(*(np.concatenate(column) for column in columns))
+    index = np.concatenate([part.first + np.arange(len(part.events)) for part in parts])
+    kept = last_written(index)
+    if not kept.all():
+        events, track = events.select(kept), track.select(kept)
+    pictures = {picture.before: picture for part in parts for picture in part.pictures}
+    return replace(
+        parts[-1], fresh=True, first=first, events=events, track=track, notices=notices,
+        pictures=[pictures[k] for k in sorted(pictures)],
+    )  # fmt: skip

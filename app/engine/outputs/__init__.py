@@ -1,0 +1,1 @@
+"""Publishers: the outputs of a twin, alerts, and their receivers."""

@@ -1,1 +1,0 @@
-"""The running twin: engine, commands, status, background jobs, revisions and tuning versions."""

@@ -1,1 +1,0 @@
-"""Runs: scores, sweeps over a parameter, noise estimates, fits and refits, as JSON for the page."""

@@ -1,1 +1,0 @@
-"""Tuning versions: made from a run or a fit, kept, accepted, loaded and listed."""

@@ -1,1 +1,0 @@
-"""Results as text, HTML, SVG and JSON, and what charts draw."""

@@ -1,1 +1,0 @@
-"""Studies over a log: advice, analysis, comparison, fits."""

@@ -1,1 +1,0 @@
-"""Viser, Rerun and recordings."""
