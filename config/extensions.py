@@ -52,7 +52,7 @@ class Extension:
     outputs: Parts = field(default_factory=dict)
     """By key under `outputs`. `make(section, engine, secrets)` returns an `app.engine.outputs.publisher.Output`."""
     receivers: Parts = field(default_factory=dict)
-    """Receivers of alerts, by `type`; `make(section, folder, secrets)` returns an `app.engine.outputs.receivers.Receiver`. An
+    """Of alerts, by `type`; `make(section, folder, secrets)` returns an `app.engine.outputs.receivers.Receiver`. An
     output of the same name is the receiver itself."""
     models: Parts = field(default_factory=dict)
     """Models in files, by the key of the file in `model`. `make(loaded, section, path)` returns a StateSpaceModel."""

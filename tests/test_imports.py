@@ -11,6 +11,20 @@ MAY_IMPORT = {
     "config": ("config", "estimators.errors"),
     "app": ("app", "sources", "config", "estimators"),
 }
+ROOMS = {
+    "twin": set(),
+    "engine": {"twin"},
+    "study": {"twin"},
+    "derive": {"engine", "study", "twin"},
+    "charts": {"derive", "engine"},
+    "render": {"charts", "derive", "engine", "study", "twin"},
+    "scene": {"charts", "engine"},
+    "explore": {"charts", "engine"},
+    "record": {"explore", "engine", "twin"},
+    "web": {"scene", "explore", "record", "render", "charts", "derive", "study", "engine", "twin"},
+    "cli": {"web", "record", "render", "study", "engine", "twin"},
+}
+"""What each room of `app` imports of the others. Modules beside the rooms belong to all, and import none."""
 IMPURE = {"os", "io", "time", "datetime", "logging", "socket", "subprocess", "threading", "asyncio", "random"}
 """What the numerics may not touch: files, clocks, logs, threads."""
 IMPURE_HERE = {
@@ -36,6 +50,18 @@ def test_direction():
         if upward := [name for name in inner if not any(within(name, allowed) for allowed in MAY_IMPORT[parts[0]])]:
             wrong["/".join(parts)] = upward
     assert wrong == {}
+
+
+def test_rooms_of_the_app():
+    def room_of(name: str) -> str:
+        return next((room for room in (*ROOMS, "extensions") if within(name, f"app.{room}")), "")
+
+    found: dict[str, set[str]] = {}
+    for name, to in edges("app").items():
+        here = room_of(name)
+        found.setdefault(here, set()).update({room_of(there) for there in to} - {here, ""})
+    del found["extensions"]
+    assert found == {"": set()} | ROOMS
 
 
 def test_estimators_are_pure():
@@ -116,7 +142,7 @@ def test_circles_are_found():
 
 def test_the_reader_of_imports_sees_every_form():
     source = """
-import app.engine
+import app.live
 from app import live
 from . import errors
 from .errors import ModelError
@@ -127,8 +153,8 @@ if TYPE_CHECKING:
     import config.schema as schema
 """
     assert imported(source, "estimators.models") == [
-        "app.engine",
-        "app.engine",
+        "app.live",
+        "app.live",
         "estimators.models.errors",
         "estimators.models.errors.ModelError",
         "estimators.sources.can_bus",

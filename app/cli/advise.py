@@ -14,7 +14,8 @@ from estimators.log import READING, Log
 from sources.formats import is_whole
 
 from ..format_time import counted
-from ..result import TableColumn, Topic, to_json, to_text
+from ..render.text import to_text
+from ..result import TableColumn, Topic, to_json
 from ..study.advice.draft import check_new, hint_lines, write_draft
 from ..study.advice.measured import AdviceProgress, Measured, digits, percent, seconds_text, without_faults
 from ..study.advice.plan import DraftPlan, Moves, plan, redundant, unit_ratio

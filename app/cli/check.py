@@ -6,7 +6,9 @@ from typing import TYPE_CHECKING
 
 from config.yaml_files import writing
 
-from ..result import to_html, to_json, to_text
+from ..render.html import to_html
+from ..render.text import to_text
+from ..result import to_json
 from ..study.check import Checked, check, figures, topics
 from ..study.checklist import checklist
 from ..study.processes import executor_of

@@ -15,7 +15,8 @@ from estimators.estimator import Estimator, Option
 from estimators.log import READING
 from estimators.registry import ESTIMATORS, unfit
 
-from ..result import Figure, TableColumn, Topic, to_json, to_text
+from ..render.text import to_text
+from ..result import Figure, TableColumn, Topic, to_json
 from ..study.advice.measured import bytes_text
 from ..twin.log_reader import read_log
 from ..twin.twin import Twin, load_twin

@@ -16,7 +16,8 @@ from estimators.errors import ConfigError
 from estimators.registry import find_estimator
 
 from ..record.rrd_file import TAKEN
-from ..result import to_json, to_text
+from ..render.text import to_text
+from ..result import to_json
 from ..study.fold_result import (
     FoldResult,
     calibration_of,
@@ -92,8 +93,8 @@ def fold_twin(arguments: Arguments) -> int:
     if out is not None:
         _write(out, result, smoothed, write)
     if arguments.html is not None:
+        from ..render.html import to_html
         from ..render.report import Reported, report
-        from ..result import to_html
 
         run = Reported(
             twin, twin.estimator, twin.tuning, events, track, pictures,

@@ -26,7 +26,8 @@ from sources.inspect import (
 from sources.tables.times import SERIAL_DAYS, UNITS, TimeColumn
 
 from ..format_time import FIRST_DATED_NS, duration_text, format_time
-from ..result import Cell, TableColumn, Topic, to_json, to_text
+from ..render.text import to_text
+from ..result import Cell, TableColumn, Topic, to_json
 from ..study.advice.draft import undecided_lines
 from ..study.advice.signals import signals
 from ..terminal import complain

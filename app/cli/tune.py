@@ -21,8 +21,8 @@ from estimators.fit.objective import FitProgress
 from estimators.fit.recording import BLOCKS, Recording
 from sources.formats import check_once
 
-from ..render.runs_json import fit_json
-from ..result import to_text
+from ..render.text import to_text
+from ..study.fit_json import fit_json
 from ..study.fold_result import rows_of
 from ..study.processes import executor_of
 from ..study.tune import fit_text, heading, sections, window_json, window_topics, windows_verdict

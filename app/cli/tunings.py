@@ -11,7 +11,8 @@ from config.yaml_files import shown_path
 from estimators.diagnostics.score import score
 from estimators.errors import ConfigError, printable
 
-from ..result import TableColumn, Topic, to_json, to_text
+from ..render.text import to_text
+from ..result import TableColumn, Topic, to_json
 from ..study.scores import pictures_of
 from ..twin.changes import difference, value_text
 from ..twin.log_reader import read_log

@@ -9,7 +9,8 @@ import numpy as np
 from estimators.attribution import Attribution, attribution
 from estimators.errors import ConfigError, nearest
 
-from ..result import to_json, to_text
+from ..render.text import to_text
+from ..result import to_json
 from ..study.why import why_json, why_topics
 from ..twin.log_reader import read_log
 from .options import moment_of

@@ -27,11 +27,12 @@ from estimators.tuning import Tuning
 
 from ..engine.history_copy import copy_log
 from ..engine.jobs import DONE, FAILED, RUNNING, Job, JobCancelled
+from ..engine.load_version import load_into
 from ..engine.running_fold import Running
 from ..format_time import format_time
 from ..twin.defaults import bounds_of, natural_aim, width_priors
 from ..twin.twin import with_held
-from ..twin.versions import keep, load_into, settings_of, version_text
+from ..twin.versions import keep, settings_of, version_text
 
 if TYPE_CHECKING:
     from estimators.fit.fit import Fitted

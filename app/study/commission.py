@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import json
 from collections.abc import Mapping
-from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -13,14 +12,10 @@ from config.loader import TWINS
 from estimators.diagnostics.episodes.baseline import Normal, commission, contradictions
 from estimators.diagnostics.score import score
 from estimators.errors import ConfigError
-from estimators.fold import Fold, folded
+from estimators.fold import Fold
 from estimators.track import DIVERGED, FAILED, GATED, SCREENED, STALE
-from estimators.tuning import CHANGED_MARK
 
-from ..engine.history_copy import copy_log
-from ..engine.running_fold import Running
 from ..twin.twin import Twin
-from ..twin.versions import write_section
 
 MAX_FAULTY_SHARE = 0.1
 """Share of readings refused, of rows lost, or of one value in a row, beyond which data are not in order."""
@@ -58,24 +53,6 @@ def baseline_of(fold: Fold, name: str, *, force: bool, option: str = "--force") 
             f"with {option}, which marks the baseline"
         )
     return {name: normal._replace(forced=broken) for name, normal in commission(fold).items()}
-
-
-def commission_running(engine: Running, *, force: bool) -> Path:
-    """Write the baseline of the running tuning over its whole history into the twin's file; return the file.
-
-    Raises:
-        ConfigError: If the tuning has edits that the file does not have, or as `baseline_of` and `write_section`.
-    """
-    twin, (tuning, estimator) = engine.twin, engine.folded_with()
-    if not storable(twin):
-        raise ConfigError(f"{twin.name}: only a twin with a YAML file of its own can store a baseline")
-    if tuning.name.endswith(CHANGED_MARK):
-        raise ConfigError(f"{twin.name}: its tuning has been edited; save it first, or undo the edits")
-    log, base = copy_log(engine, tuning)
-    fold = folded(estimator, engine.model, replace(tuning, baseline=None), log, policy=engine.policy, base=base)
-    normals = baseline_of(fold, twin.name, force=force, option="Store anyway")
-    write_section(section_file(twin), "commissioned", lines(normals))
-    return section_file(twin)
 
 
 def against(fold: Fold) -> str:

@@ -17,9 +17,9 @@ from estimators.fit.judge import PartScore, PredictionScore, Worth
 from estimators.fit.objective import FitProgress
 from estimators.registry import find_estimator
 
-from ..render.runs_json import correlated, fit_json
 from ..result import Topic, finite_text
 from ..twin.twin import Twin
+from .fit_json import correlated, fit_json
 
 MOVES_SHOWN = 2  # entries in a line of progress
 MINUTES_FROM_S = 100.0  # remaining time from which it is given in minutes

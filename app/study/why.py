@@ -7,11 +7,9 @@ from typing import Any
 
 import numpy as np
 
-from estimators.attribution import Attribution, attribution
-from estimators.errors import EstimatorError
+from estimators.attribution import Attribution
 from estimators.model.state_space import StateSpaceModel
 
-from ..engine.running_fold import Running
 from ..result import Cell, TableColumn, Topic
 
 MODEL, RESTARTS = "model", "restarts"
@@ -19,18 +17,6 @@ MODEL, RESTARTS = "model", "restarts"
 
 MIN_SHARE = 0.001
 """Share of the largest contribution to a state below which a cause is not listed."""
-
-
-def change_of(engine: Running, since: int, until: int) -> Attribution:
-    """Attribute the change of a running twin's estimate between two times, ns.
-
-    Raises:
-        EstimatorError: If there are no events, too many, or they are not kept any more.
-    """
-    window = engine.window(since, until)
-    if window is None:
-        raise EstimatorError("the estimate of this span is not there; choose a later one, or ask again")
-    return attribution(window.fold(policy=engine.policy, expected=engine.twin.expected), since, until)
 
 
 def causes(model: StateSpaceModel, found: Attribution) -> list[tuple[str, str, int | None, np.ndarray]]:

@@ -21,10 +21,8 @@ from estimators.errors import LARGEST, ConfigError
 from estimators.registry import find_estimator
 from estimators.tuning import Tuning
 
-from ..engine.running_fold import Running
-from .changes import obstacle
 from .tuning_yaml import tuning_yaml, with_spread, with_tuning
-from .twin import Twin, with_version
+from .twin import Twin
 
 if TYPE_CHECKING:
     from estimators.fit.fit import Fitted
@@ -248,23 +246,6 @@ def verdicts(twin: Path) -> list[dict[str, Any]]:
 def _header(head: VersionSection) -> str:
     given = head.model_dump(mode="json", exclude_defaults=True)
     return "".join(f"{line}\n" for line in as_section("version", given))
-
-
-def load_into(engine: Running, name: str, why: str | None = None) -> None:
-    """Queue the change to a version of the twin, or to `own`; the history is folded again with it.
-
-    `why` is the reason of the new run; None for the version's name.
-
-    Raises:
-        ConfigError: If there is no such version, it is wrong, or it does not fit the running twin.
-    """
-    twin = with_version(engine.twin, name)
-    reason = obstacle(engine.twin, twin, from_prior=engine.rows(0, 0).first == 0)
-    if reason is not None:
-        raise ConfigError(f"{name}: {reason}; start the twin with --tuning {name}")
-    # Compiled before the engine's thread asks for it.
-    twin.fold(pairs=twin.pairs, idle=True)
-    engine.reload(twin, f"version {name}" if why is None else why, exact=True)
 
 
 def widths_of(twin: Twin, found: Fitted) -> ParameterWidths | None:

@@ -161,7 +161,7 @@ def _progress_json(attempt: FitAttempt) -> dict[str, Any]:
 
 
 def _result_json(fitted: Fitted) -> dict[str, Any]:
-    from ..render.runs_json import fit_json  # which imports SciPy's optimisers, 0.5 s
+    from ..study.fit_json import fit_json  # which imports SciPy's optimisers, 0.5 s
 
     return {"result": fit_json(fitted)}
 

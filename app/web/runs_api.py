@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import re
 from collections.abc import Sequence
+from dataclasses import replace
+from pathlib import Path
 from typing import Any
 
 from starlette.convertors import IntegerConvertor, register_url_convertor
@@ -15,22 +17,26 @@ from config.tunings import NAME
 from estimators.diagnostics.episodes import Episode
 from estimators.diagnostics.sensitivity.responses import digits
 from estimators.errors import ConfigError, printable
+from estimators.fold import folded
+from estimators.tuning import CHANGED_MARK
 
 from ..charts.chart_stream import Seconds
 from ..charts.series import Series
 from ..derive.run_scores import RunScores
 from ..derive.sweep import Sweeps, noise
+from ..engine.history_copy import copy_log
+from ..engine.load_version import load_into
 from ..engine.revisions import MAX_NOTE_LENGTH, Revision
 from ..engine.running_fold import Running
+from ..render.html import to_html
 from ..render.report import Reported, report
 from ..render.runs_json import changes_json, noise_json, runs_json, swept_json, what_changed
 from ..render.track_file import KINDS, encoded, rows_of_run, tables
-from ..result import to_html
-from ..study.commission import commission_running
+from ..study.commission import baseline_of, lines, section_file, storable
 from ..twin.changes import difference
 from ..twin.tuning_yaml import tuning_yaml
 from ..twin.twin import with_version
-from ..twin.versions import Settings, figures, keep, listing, load_into, verdicts, version_text
+from ..twin.versions import Settings, figures, keep, listing, verdicts, version_text, write_section
 from .http import OneAtATime, get, post
 
 MAX_ERRORS = 6
@@ -217,3 +223,21 @@ def _scored(scores: RunScores) -> tuple[tuple[str, ...], ...]:
             line = digits(known.score.nis_verdict.ratio), f"{known.log_likelihood_reading:.4g}", errors
         lines.append((f"{run.number} {run.name}".rstrip(), what_changed(run, there), *line))
     return tuple(lines)
+
+
+def commission_running(engine: Running, *, force: bool) -> Path:
+    """Write the baseline of the running tuning over its whole history into the twin's file; return the file.
+
+    Raises:
+        ConfigError: If the tuning has edits that the file does not have, or as `baseline_of` and `write_section`.
+    """
+    twin, (tuning, estimator) = engine.twin, engine.folded_with()
+    if not storable(twin):
+        raise ConfigError(f"{twin.name}: only a twin with a YAML file of its own can store a baseline")
+    if tuning.name.endswith(CHANGED_MARK):
+        raise ConfigError(f"{twin.name}: its tuning has been edited; save it first, or undo the edits")
+    log, base = copy_log(engine, tuning)
+    fold = folded(estimator, engine.model, replace(tuning, baseline=None), log, policy=engine.policy, base=base)
+    normals = baseline_of(fold, twin.name, force=force, option="Store anyway")
+    write_section(section_file(twin), "commissioned", lines(normals))
+    return section_file(twin)

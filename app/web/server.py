@@ -21,7 +21,8 @@ from starlette.staticfiles import StaticFiles
 from starlette.websockets import WebSocket
 
 from config.extensions import made, maker, registered
-from estimators.errors import ConfigError, NisusError
+from estimators.attribution import attribution
+from estimators.errors import ConfigError, EstimatorError, NisusError
 
 from ..charts.colors import EITHER, THEMES
 from ..charts.series import Series
@@ -35,7 +36,7 @@ from ..engine.outputs.alerts import alert_schema
 from ..engine.outputs.state_message import StateMessage, state_message, state_schema
 from ..engine.running_fold import Running
 from ..result import plain
-from ..study.why import change_of, why_json
+from ..study.why import why_json
 from ..terminal import messages_file
 from . import readings
 from .commands_json import command_from_json, commands_schema
@@ -243,7 +244,11 @@ class PageServer:
         """Attribute the change of the estimate between two times of the charts, s."""
         model, origin = self._engine.model, self.series.origin() or 0
         begin, end = (origin + round(max(-1e9, min(at, 1e9)) * 1e9) for at in (since, until))
-        return dict(plain(why_json(model, change_of(self._engine, begin, end), origin)))
+        window = self._engine.window(begin, end)
+        if window is None:
+            raise EstimatorError("the estimate of this span is not there; choose a later one, or ask again")
+        fold = window.fold(policy=self._engine.policy, expected=self._engine.twin.expected)
+        return dict(plain(why_json(model, attribution(fold, begin, end), origin)))
 
     def _annotations(self) -> list[dict[str, Any]]:
         """Return all notes of users by time."""

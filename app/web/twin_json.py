@@ -16,9 +16,9 @@ from ..engine import faults
 from ..engine.copies import Status
 from ..engine.running_fold import Running
 from ..render.report_charts import charted_model
-from ..render.runs_json import nis_json
 from ..result import plain
 from ..study.commission import storable
+from ..study.fit_json import nis_json
 from ..twin.changes import began_as, turned
 
 STATUS_FIELDS = (

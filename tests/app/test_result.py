@@ -8,7 +8,9 @@ import numpy as np
 import pytest
 
 from app.format_time import counted, format_time
-from app.result import MAX_TABLE_WIDTH, WIDTH, Figure, TableColumn, Topic, number_text, to_html, to_json, to_text
+from app.render.html import to_html
+from app.render.text import MAX_TABLE_WIDTH, WIDTH, to_text
+from app.result import Figure, TableColumn, Topic, number_text, to_json
 
 
 def test_wide_rows_become_paragraphs_whose_short_cells_keep_their_heading():

@@ -1,4 +1,4 @@
-"""Alerts by e-mail and to programs. Rules, queues and the web hook are the core's: app/outputs."""
+"""Alerts by e-mail and to programs. Rules, queues and the web hook are the core's: app/engine/outputs."""
 
 from config.extensions import Extension, Part
 

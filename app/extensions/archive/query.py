@@ -6,7 +6,8 @@ import sys
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from app.result import Topic, to_json, to_text
+from app.render.text import to_text
+from app.result import Topic, to_json
 from estimators.errors import ConfigError, nearest
 
 from .parts import parts_of

@@ -19,8 +19,9 @@ from app.extensions.service.command import PRELOADED, door_of, run_child, serve_
 from app.extensions.service.service import Service
 from app.extensions.service.supervisor import Supervisor
 from app.record.rrd_file import parse_split
+from app.render.text import to_text
 from app.render.track_file import encoded
-from app.result import to_json, to_text
+from app.result import to_json
 from app.terminal import complain, until_asked_to_end
 from app.twin.log_reader import remarking
 from config.yaml_files import writing

@@ -10,7 +10,8 @@ from typing import TYPE_CHECKING
 
 from app.cli.options import check_output, names_of, overrides_of
 from app.cli.prepare import attend, prepare
-from app.result import to_json, to_text
+from app.render.text import to_text
+from app.result import to_json
 from app.terminal import complain
 from app.twin.log_reader import read_log
 from app.twin.model import physics_of

@@ -8,8 +8,8 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from app.render.runs_json import part_json
 from app.result import Topic
+from app.study.fit_json import part_json
 from app.twin.twin import Twin
 from app.twin.versions import now
 from config.yaml_files import as_flow, as_section, rounded

@@ -8,7 +8,8 @@ import numpy as np
 import pytest
 
 from app.cli.main import main
-from app.result import Bar, Topic, to_html
+from app.render.html import to_html
+from app.result import Bar, Topic
 from estimators.diagnostics.sensitivity.responses import Nudge
 
 REQUIRED = {"checklist", "observability", "smallest_visible", "integrity", "held_out", "open_loop"}

@@ -9,7 +9,7 @@ import pyarrow.parquet as pq
 import pytest
 from rerun.chunk import RrdReader
 
-from app.result import to_text
+from app.render.text import to_text
 from app.study.compare import fold_row
 from app.study.fold_result import ExplainedEpisode, dropped, episodes_topic
 from app.twin.log_reader import read_log

@@ -15,7 +15,7 @@ import numba
 import numpy as np
 import pytest
 
-from app.render.runs_json import fit_json
+from app.study.fit_json import fit_json
 from app.study.processes import executor_of, jobs_of, results
 from config import extensions
 from estimators.errors import ConfigError

@@ -13,11 +13,12 @@ import yaml
 from app.cli.arguments import FoldCommand
 from app.cli.fold import fold_twin
 from app.cli.open_twin import recorded_twin
+from app.engine.load_version import load_into
 from app.record.reader import read_recording
 from app.twin.log_reader import read_log
 from app.twin.tuning_yaml import tuning_yaml, with_tuning
 from app.twin.twin import load_twin, restore_twin, with_held
-from app.twin.versions import Settings, accept, apply_tuning, keep, load_into, version_text
+from app.twin.versions import Settings, accept, apply_tuning, keep, version_text
 from config.loader import TWINS, shipped
 from config.tunings import accepted_version, find_version, folders, load_version, version_files
 from estimators.errors import ConfigError

@@ -7,7 +7,8 @@ from typing import TYPE_CHECKING
 
 from app.cli.options import check_output, overrides_of
 from app.cli.prepare import progress
-from app.result import to_json, to_text
+from app.render.text import to_text
+from app.result import to_json
 from config.yaml_files import writing
 from estimators.errors import ConfigError, printable
 

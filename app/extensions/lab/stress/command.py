@@ -6,7 +6,8 @@ from typing import TYPE_CHECKING
 
 from app.cli.options import overrides_of
 from app.cli.prepare import opened, prepare, progress
-from app.result import to_json, to_text
+from app.render.text import to_text
+from app.result import to_json
 from app.terminal import complain
 from estimators.errors import ConfigError
 from estimators.registry import find_estimator
