@@ -38,7 +38,7 @@ from estimators.track import ADVISORY, DEGRADED, DIVERGED, SUSPECT, TRACKING, WA
 from estimators.tuning import Tuning
 from sources.faults.kinds import problem
 from tests.app.cli.test_main import documented
-from tests.app.engine.runs.test_noise import WHITE_NOISE
+from tests.app.derive.test_noise import WHITE_NOISE
 from tests.support import SECOND, as_log, log_of
 
 MODEL = MODELS["motor_drive"]
