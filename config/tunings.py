@@ -22,7 +22,7 @@ NAME = re.compile(r"[A-Za-z0-9][A-Za-z0-9_.-]{0,59}")
 
 SPREADS = ("variance", "std")  # Alternatives: one replaces the other
 
-_CONFIG = Path(str(resources.files("config")))
+_CONFIG = Path(str(resources.files(__package__)))
 SHIPPED = _CONFIG / "tunings"  # Folder of the versions that ship, a folder for each twin
 
 

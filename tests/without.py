@@ -18,7 +18,7 @@ from pathlib import Path
 from config.extensions import GROUP, extensions
 from tests import ROOT
 
-FOLDERS = ("app", "config", "estimators", "sources", "tests", "docs/examples")
+FOLDERS = ("nisus", "app", "config", "estimators", "sources", "tests", "docs/examples")
 QUICK = ("tests/config", "tests/app/twin/test_source.py", "tests/app/test_result.py")
 """Tests of the core that take seconds."""
 

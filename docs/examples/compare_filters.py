@@ -7,7 +7,7 @@ import math
 
 import numpy as np
 
-from estimators import Log, Noise, Row, Sensor, State, StateSpaceModel, fold_many, mean_nees
+from nisus import Log, Noise, Row, Sensor, State, StateSpaceModel, fold_many, mean_nees
 
 GRAVITY, STEP = 9.81, 0.05  # 1/s² for a length of 1 m; s
 

@@ -10,7 +10,7 @@ import math
 
 import numpy as np
 
-from estimators import Log, Noise, Row, Sensor, State, StateSpaceModel, fold
+from nisus import Log, Noise, Row, Sensor, State, StateSpaceModel, fold
 
 
 def turn(x, u, p, dt, out):

@@ -46,7 +46,9 @@ def _guard(function: Callable[..., Any]) -> Callable[..., Any]:
     return guarded
 
 
-OWN_PACKAGES = tuple(Path(__file__).resolve().parents[2] / name for name in ("estimators", "sources", "config", "app"))
+OWN_PACKAGES = tuple(
+    Path(__file__).resolve().parents[2] / name for name in ("nisus", "estimators", "sources", "config", "app")
+)
 
 
 def imported_beside(path: Path) -> tuple[Path, ...]:

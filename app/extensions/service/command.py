@@ -32,7 +32,7 @@ if TYPE_CHECKING:
 
     from .arguments import ServeCommand, ServiceOptions
 
-PRELOADED = ("app.extensions.service.preloaded",)
+PRELOADED = (f"{__package__}.preloaded",)
 """Modules that the processes of the twins share: they are imported once."""
 
 

@@ -5,10 +5,10 @@ import socket
 import threading
 from typing import Literal
 
-from config.channels import MessagesSection
-from config.extensions import Extension, Part
-from config.fields import Host, Port, Section
-from estimators.errors import SourceError
+from nisus.config.channels import MessagesSection
+from nisus.config.extensions import Extension, Part
+from nisus.config.fields import Host, Port, Section
+from nisus.estimators.errors import SourceError
 
 
 class UdpSourceSection(MessagesSection):
