@@ -1,5 +1,7 @@
 """Imports run one way: app → sources → estimators; config describes and may know only the errors."""
 
+import re
+
 from config.extensions import extensions
 from tests import ROOT
 from tests.imports import PACKAGES, edges, imported, modules
@@ -132,6 +134,19 @@ def test_no_room_imports_in_a_circle():
         graph.setdefault(here, set()).update(
             there for there in map(room, to) if not within(there, here) and not within(here, there)
         )
+    assert circles(graph) == []
+
+
+def test_no_script_of_the_page_imports_in_a_circle():
+    page = ROOT / "app" / "web" / "page"
+    scripts = {path.resolve(): path.read_text() for path in page.rglob("*.js") if "vendor" not in path.parts}
+    graph = {
+        str(path.relative_to(page)): {
+            str((path.parent / name).resolve().relative_to(page)) for name in re.findall(r'from "(\.[^"]+)"', text)
+        }
+        for path, text in scripts.items()
+    }
+    assert "http.js" in graph["session.js"]
     assert circles(graph) == []
 
 

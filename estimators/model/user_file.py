@@ -46,9 +46,8 @@ def _guard(function: Callable[..., Any]) -> Callable[..., Any]:
     return guarded
 
 
-OWN_PACKAGES = tuple(
-    Path(__file__).resolve().parents[2] / name for name in ("nisus", "estimators", "sources", "config", "app")
-)
+OWN = ("nisus", "estimators", "sources", "config", "app")
+OWN_PACKAGES = [Path(__file__).resolve().parents[2] / name for name in OWN]
 
 
 def imported_beside(path: Path) -> tuple[Path, ...]:

@@ -3,7 +3,7 @@
 
 import { element, setText } from "./dom.js";
 import { clock, compact, count, span, spaced } from "./format.js";
-import { post } from "./session.js";
+import { post } from "./http.js";
 
 const RECORDING = ".rrd";
 const DATABASE = ".dbc";

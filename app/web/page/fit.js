@@ -4,6 +4,7 @@
 import { Panel } from "./controls.js";
 import { element, setText } from "./dom.js";
 import { clock, compact, count, spaced, span, words } from "./format.js";
+import { post } from "./http.js";
 
 const FIT_PERIOD = 300; // ms between two progress queries
 const GROUPS = { Q: "Q", R: "R", p: "parameters", options: "options" };
@@ -61,8 +62,7 @@ export class Fit {
 
   async ask(method, body) {
     clearTimeout(this.timer);
-    const answer = await fetch("api/fit", { method, ...(body ? { headers: { "Content-Type": "application/json" }, body: JSON.stringify(body) } : {}) }).catch(() => null);
-    const told = answer?.headers.get("content-type")?.includes("json") ? await answer.json() : { error: "no answer from the twin" };
+    const told = await post("api/fit", body, method);
     this.say(told.error ?? "");
     if (!told.error) this.take(told);
     else if (BUSY.includes(this.told?.state)) this.timer = setTimeout(() => this.ask("GET"), 10 * FIT_PERIOD);
@@ -127,9 +127,9 @@ export class Fit {
     const name = element("input", { type: "text", id: "fit-name", "aria-label": "Name of the version", placeholder: "name", maxlength: 60, value: `fit-${told.number}` });
     const keep = async () => {
       const note = `fitted: ${told.wanted.join(", ")}`;
-      const answer = await fetch("api/fit/keep", { method: "POST", headers: { "Content-Type": "application/json" }, body: JSON.stringify({ name: name.value.trim(), note }) }).catch(() => null);
-      this.say(answer?.ok ? "" : ((await answer?.json().catch(() => null))?.error ?? "no answer from the twin"));
-      setText(kept, answer?.ok ? `kept as ${name.value.trim()}, see Runs` : "");
+      const { error = "" } = await post("api/fit/keep", { name: name.value.trim(), note });
+      this.say(error);
+      setText(kept, error ? "" : `kept as ${name.value.trim()}, see Runs`);
     };
     const kept = element("span", { class: "faint", role: "status" });
     return [element("span", { class: "space" }), name, element("button", { type: "button", id: "fit-keep", class: "go", title: "Save as a tuning version, with its scores on the held-out blocks", onclick: keep }, "Keep as a version"), kept];
@@ -266,10 +266,9 @@ export class Refit {
 
   // Says why where it is refused.
   async post(path, fields) {
-    const answer = await fetch(path, { method: "POST", headers: { "Content-Type": "application/json" }, body: JSON.stringify(fields) }).catch(() => null);
-    const reason = answer?.ok ? "" : ((await answer?.json().catch(() => null))?.error ?? "no answer from the twin");
-    setText(this.error, reason);
-    this.error.hidden = !reason;
+    const { error = "" } = await post(path, fields);
+    setText(this.error, error);
+    this.error.hidden = !error;
     await this.look();
   }
 
@@ -341,8 +340,7 @@ export class Advice {
 
   async ask(method) {
     clearTimeout(this.timer);
-    const answer = await fetch("api/advice", { method, ...(method === "POST" ? { headers: { "Content-Type": "application/json" }, body: "{}" } : {}) }).catch(() => null);
-    const told = answer?.headers.get("content-type")?.includes("json") ? await answer.json() : { error: "no answer from the twin" };
+    const told = await post("api/advice", method === "POST" ? {} : undefined, method);
     this.say(told.error ?? told.reason);
     if (told.error) return;
     const busy = BUSY.includes(told.state);

@@ -5,7 +5,8 @@ import { keys } from "./controls.js";
 import { $, element, setAttribute, setText } from "./dom.js";
 import { drops, LogView } from "./dropped_log.js";
 import { compact, count, spaced, span } from "./format.js";
-import { card, post, progress, Session } from "./session.js";
+import { post } from "./http.js";
+import { card, progress, Session } from "./session.js";
 
 const SUMMARY_POLL_MS = 1500; // while a file is being summarised
 const POLL_MS = 5000;

@@ -1,5 +1,6 @@
 // Connection of the page to the twin: status, episodes, notices and chart points arrive here; commands leave here.
 
+import { post } from "./http.js";
 import { PageSocket } from "./socket.js";
 import { unpack } from "./stream.js";
 
@@ -110,17 +111,6 @@ export class Link extends EventTarget {
   // Ask something of the twin. Resolves to null, or to the reason why not.
   async ask(command, fields = {}) {
     this.turned = performance.now();
-    try {
-      const answer = await fetch("api/command", {
-        method: "POST",
-        headers: { "Content-Type": "application/json" },
-        body: JSON.stringify({ command, ...fields }),
-      });
-      if (answer.ok) return null;
-      const text = await answer.text();
-      return answer.headers.get("content-type")?.includes("json") ? JSON.parse(text).error : text.trim();
-    } catch {
-      return "no answer from the twin";
-    }
+    return (await post("api/command", { command, ...fields })).error ?? null;
   }
 }

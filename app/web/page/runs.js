@@ -3,6 +3,7 @@
 
 import { element, setText } from "./dom.js";
 import { bracketed, compact, count, spaced, span, words } from "./format.js";
+import { post } from "./http.js";
 import { swatch } from "./layers.js";
 import { gone } from "./save.js";
 
@@ -247,11 +248,10 @@ class Versions {
 
   // Show the reason of a refusal; resolves to whether it was done.
   async ask(path, fields) {
-    const answer = await fetch(path, { method: "POST", headers: { "Content-Type": "application/json" }, body: JSON.stringify(fields) }).catch(() => null);
-    const reason = answer?.ok ? null : ((await answer?.json().catch(() => null))?.error ?? "no answer");
-    this.say(reason);
+    const { error = null } = await post(path, fields);
+    this.say(error);
     await this.list();
-    return !reason;
+    return !error;
   }
 
   keep(run) {

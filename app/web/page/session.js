@@ -2,6 +2,7 @@
 
 import { $, element, setAttribute, setText } from "./dom.js";
 import { drops } from "./dropped_log.js";
+import { post } from "./http.js";
 
 const REST = 700; // ms
 const HASTE = 250; // while something is being started
@@ -55,17 +56,6 @@ function leave() {
 
 // How far what is being started has come.
 export const progress = ({ doing, seconds }) => `${doing || "starting"} … ${Math.floor(seconds)} s`;
-
-// Resolves to the answer, or {error} with the reason.
-export async function post(path, body, method = "POST") {
-  try {
-    const answer = await fetch(path, { method, headers: { "Content-Type": "application/json" }, body: JSON.stringify(body) });
-    const text = await answer.text();
-    return answer.headers.get("content-type")?.includes("json") ? JSON.parse(text) : { error: text.trim() };
-  } catch {
-    return { error: "Nisus does not answer" };
-  }
-}
 
 // One twin of the gallery: picture, question, lesson, and a button to start it, or the reason why it cannot.
 

@@ -2,6 +2,7 @@
 
 import { $, element, setAttribute, setText } from "./dom.js";
 import { clock, span, words } from "./format.js";
+import { post } from "./http.js";
 
 const MAX_LEAD_S = 1; // s by which the scene may differ from the charts without a word
 const LARGE = "nisus.stage.large";
@@ -80,13 +81,9 @@ export class Stage {
     select.append(...options.map((option) => element("option", { value: option }, words(option))));
     select.value = value;
     select.addEventListener("change", async () => {
-      const answer = await fetch("api/scene", {
-        method: "POST",
-        headers: { "Content-Type": "application/json" },
-        body: JSON.stringify({ key, value: select.value }),
-      }).catch(() => null);
+      const answer = await post("api/scene", { key, value: select.value });
       select.blur();
-      if (answer?.ok) this.offer(await answer.json());
+      if (!answer.error) this.offer(answer);
     });
     return select;
   }

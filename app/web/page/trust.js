@@ -2,7 +2,7 @@
 
 import { $, element, setAttribute, setText } from "./dom.js";
 import { clock, compact, inChartTime, spaced, span, words } from "./format.js";
-import { post } from "./session.js";
+import { post } from "./http.js";
 
 // Signs beside the colours, for users who cannot distinguish them.
 export const SIGNS = {
