@@ -19,10 +19,10 @@ from urllib.error import HTTPError, URLError
 from urllib.parse import parse_qs, urlsplit
 from urllib.request import ProxyHandler, Request, build_opener
 
+from app.result import to_json
+from app.terminal import complain
 from estimators.errors import ConfigError, nearest, quoted, shown_name
 
-from ..result import to_json
-from ..terminal import complain
 from .arguments import PushCommand as Arguments
 
 MAX_BATCH_LINES, BATCH_S = 2000, 0.02  # Lines sent at once, and the wait for further ones after the first
