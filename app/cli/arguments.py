@@ -407,29 +407,6 @@ class ReviewCommand(PageOptions):
 
 
 @dataclass(frozen=True)
-class BusCommand(JsonOption):
-    """Simulate the asset of a twin on a CAN bus.
-
-    Examples:
-      nisus bus motor_can
-      nisus bus motor_can --interface virtual --record drive.blf --duration 60
-    """
-
-    twin: Twin
-    """Name of a bundled twin with a CAN source and an `asset`, or path to a YAML file."""
-    interface: str = "udp_multicast"
-    """Interface of python-can: udp_multicast reaches other processes on this machine, socketcan a real bus."""
-    channel: str | None = None
-    """Channel of the interface. Default: the twin's if it fits, else the interface's own."""
-    set: Repeated = ()
-    """KEY=VALUE of the YAML, repeatable."""
-    duration: float | None = None
-    """Stop after this many seconds."""
-    record: Path | None = None
-    """Also write the frames to this log (.blf, .asc, .log, .csv, .mf4, .trc)."""
-
-
-@dataclass(frozen=True)
 class TwinsCommand(JsonOption):
     """List the bundled twins, or describe one with the scores of every filter.
 
@@ -524,7 +501,6 @@ COMMANDS: dict[type, str] = {
     CommissionCommand: "commission:commission_twin",
     FiltersCommand: "filters:show_filters",
     ReviewCommand: "run:review_recording",
-    BusCommand: "bus:play_bus",
     TwinsCommand: "twins:show_twins",
     TuningsCommand: "tunings:tunings_of",
     SchemaCommand: "new:write_schema",

@@ -1,3 +1,4 @@
+import shlex
 from collections import Counter
 from typing import Any
 
@@ -5,11 +6,12 @@ import can
 import numpy as np
 import pytest
 
-from app.cli import bus
-from app.cli.arguments import BusCommand
+from app.extensions.can_output import bus
+from app.extensions.can_output.arguments import BusCommand
 from app.twin.sources.asset import make_asset
 from app.twin.twin import load_twin
 from estimators.log import INPUT, READING, TRUTH, truth_of
+from tests.cases import cases
 from tests.support import Clock, read_all
 
 
@@ -79,3 +81,15 @@ def test_the_channel(interface, channel, expected):
     assert (
         bus._channel(BusCommand("motor_can", interface=interface, channel=channel), load_twin("motor_can")) == expected
     )
+
+
+@cases(__file__, "bad_arguments.csv")
+def test_a_wrong_argument_is_one_line(said, command, nisus, tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    assert said in nisus.refuses("bus", *shlex.split(command))
+    assert not list(tmp_path.iterdir())
+
+
+def test_the_json_has_the_fields_of_the_guide(nisus, tmp_path):
+    options = ("--interface", "virtual", "--record", tmp_path / "drive.blf", "--duration", 0.2, "--json")
+    assert nisus("bus", "motor_can", *options).json.keys() == {"twin", "frames", "counts"}

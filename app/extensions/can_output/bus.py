@@ -8,12 +8,11 @@ from collections import Counter
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from app.cli.options import overrides_of
+from app.result import to_json
+from app.terminal import complain, until_asked_to_end
+from app.twin.twin import Twin, load_twin
 from estimators.errors import ConfigError
-
-from ..result import to_json
-from ..terminal import complain, until_asked_to_end
-from ..twin.twin import Twin, load_twin
-from .options import overrides_of
 
 if TYPE_CHECKING:
     from .arguments import BusCommand
