@@ -21,13 +21,12 @@ from estimators.model.state_space import StateSpaceModel
 from .channels import channels, read_faults
 from .defaults import rhythm
 from .sources.asset import SIMULATOR
-from .sources.can import CAN, CAN_LOG, make_player
+from .sources.can import CAN, CAN_LOG
 from .sources.kind import Kind, Opening, find_databases, find_recording
 from .sources.push import PUSH, of_messages
 from .sources.recordings import MERGED, TABLE
 
 if TYPE_CHECKING:
-    from sources.can.player import Player
     from sources.faults.kinds import Fault
     from sources.faults.layer import Faults
     from sources.source import Report, Source
@@ -150,14 +149,6 @@ class Plan:
             source.close()
             source = Pacer(bare, speed=speed)
         return FaultySource(source, layer)
-
-    def player(self, report: Report, *, interface: str | None = None, channel: str | int | None = None) -> Player:
-        """Return the asset of a twin on a CAN bus, ready to play there, or on another `interface` and `channel`.
-
-        Raises:
-            SourceError: If the source is not a bus, it has no `asset`, or the bus cannot be opened.
-        """
-        return make_player(self.loaded, self.model, report, interface=interface, channel=channel)[1]
 
 
 def plan_source(loaded: Loaded, model: StateSpaceModel, log_files: Sequence[Path] | None) -> Plan:

@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING, Any
 from app.cli.options import overrides_of
 from app.result import to_json
 from app.terminal import complain, until_asked_to_end
+from app.twin.sources.can import make_player
 from app.twin.twin import Twin, load_twin
 from estimators.errors import ConfigError
 
@@ -38,7 +39,7 @@ def play_bus(arguments: BusCommand) -> int:
         if counts[key] == 1:
             complain(text)
 
-    player = twin.plan.player(report, interface=arguments.interface, channel=channel)
+    player = make_player(twin.loaded, twin.model, report, interface=arguments.interface, channel=channel)[1]
     logger = None
     try:
         if arguments.record is not None:

@@ -5,6 +5,7 @@ import numpy as np
 import pytest
 
 from app.twin.log_reader import read_log
+from app.twin.sources.can import make_player
 from estimators import errors
 from estimators.errors import ConfigError, SourceError
 from estimators.log import INPUT, READING, TRUTH, Events
@@ -330,7 +331,8 @@ def test_a_virtual_bus_plays_its_own_asset():
     ],
 )
 def test_what_has_no_asset_cannot_play_one(text, expected):
-    assert error_of(SourceError, twin_of(text).plan.player, lambda key, text: None) == expected
+    twin = twin_of(text)
+    assert error_of(SourceError, make_player, twin.loaded, twin.model, lambda key, text: None) == expected
 
 
 def test_a_truth_of_another_model_must_fit():

@@ -9,8 +9,10 @@ import pytest
 from app.extensions.can_output import bus
 from app.extensions.can_output.arguments import BusCommand
 from app.twin.sources.asset import make_asset
+from app.twin.sources.can import make_player
 from app.twin.twin import load_twin
 from estimators.log import INPUT, READING, TRUTH, truth_of
+from sources.source import ignore
 from tests.cases import cases
 from tests.support import Clock, read_all
 
@@ -53,7 +55,7 @@ def test_what_is_recorded_is_what_the_asset_said(suffix, tmp_path, monkeypatch):
 
 def test_listeners_hear_what_the_bus_took(monkeypatch):
     twin = load_twin("motor_can", overrides={"source.asset.duration": "1"})
-    player = twin.plan.player(lambda key, text: None, interface="virtual", channel="test-listeners")
+    player = make_player(twin.loaded, twin.model, ignore, interface="virtual", channel="test-listeners")[1]
     ear = can.Bus(interface="virtual", channel="test-listeners")
     heard: list[can.Message] = []
     player.listeners.append(heard.append)
