@@ -92,7 +92,7 @@ RESERVED: Mapping[str, tuple[str, ...]] = {
 }
 """Names of the core by kind, which no extension may take; commands of the core come before those of one name."""
 
-GUARDED = ("sources", "outputs", "receivers", "models", "routes", "panels")
+GUARDED = ("commands", "sources", "outputs", "receivers", "models", "routes", "panels")
 """Kinds whose functions end in a line, not in a traceback; see `maker`."""
 
 TAGGED = ("sources", "receivers")

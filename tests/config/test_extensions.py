@@ -1,6 +1,7 @@
 """Extensions of other packages: what they add, and what a broken one costs."""
 
 import json
+import shlex
 
 from app.twin.source import SOURCES
 from config.extensions import RESERVED, registered
@@ -12,7 +13,8 @@ from tests.support import run_python
 
 NAME = "nisus_depth"
 
-MODULE = """
+MODULE = '''
+from dataclasses import dataclass
 from typing import Literal
 
 from config.channels import MessagesSection
@@ -32,8 +34,16 @@ def open_depth(opening):
     return messages
 
 
-EXTENSION = Extension(sources={"depth": Part("nisus_depth:DepthSection", "nisus_depth:open_depth")})
-"""
+@dataclass
+class SoundCommand:
+    """Measure a depth."""
+
+
+EXTENSION = Extension(
+    commands={"sound": Part("nisus_depth:SoundCommand", "nisus_depth:sound")},
+    sources={"depth": Part("nisus_depth:DepthSection", "nisus_depth:open_depth")},
+)
+'''
 
 OPENED = """
 import sys
@@ -83,10 +93,11 @@ def test_a_broken_one_is_a_line_and_stops_only_a_twin_that_needs_it(tmp_path, mo
 
 
 @cases(__file__, "failing_functions.csv")
-def test_a_function_that_fails_is_one_line_for_the_twin_that_asks_for_it(tmp_path, monkeypatch, name, text):
-    module = MODULE.replace("nisus_depth:open_depth", f"nisus_depth:{name}")
-    module += "\nnothing = lambda opening: None\nbroken = lambda opening: 1 / 0\n"
-    done = run(monkeypatch, installed(tmp_path, module, "depth = nisus_depth:EXTENSION"), COMMANDS)
+def test_a_function_that_fails_is_one_line_for_who_asks_for_it(tmp_path, monkeypatch, part, name, words, text):
+    module = MODULE.replace(f"nisus_depth:{part}", f"nisus_depth:{name}")
+    module += "\nnothing = lambda given: None\nbroken = lambda given: 1 / 0\n"
+    code = f"from app.cli.main import main; raise SystemExit(main({shlex.split(words)}))"
+    done = run(monkeypatch, installed(tmp_path, module, "depth = nisus_depth:EXTENSION"), code, status=2)
     assert done.stderr == f"nisus: extension depth: {text}\n"
 
 
