@@ -95,6 +95,9 @@ RESERVED: Mapping[str, tuple[str, ...]] = {
 GUARDED = ("commands", "sources", "outputs", "receivers", "models", "routes", "panels")
 """Kinds whose functions end in a line, not in a traceback; see `maker`."""
 
+SECTIONS: tuple[Kind, ...] = ("sources", "outputs", "receivers", "models")
+"""Kinds whose schema is a section of the YAML."""
+
 TAGGED = ("sources", "receivers")
 """Kinds of which a section is recognised by its `type`, a literal that is the name of the part."""
 
@@ -157,7 +160,7 @@ def schemas(kind: Kind) -> dict[str, Any]:
 def _usable(reference: str, kind: Kind, key: str) -> Any:
     """Return a class of options or sections; one that would stop every twin is refused."""
     schema = pkgutil.resolve_name(reference)
-    if kind != "commands":
+    if kind in SECTIONS:
         from .channels import MessagesSection  # here, as commands without a YAML do not wait for pydantic
         from .fields import Section
 
@@ -172,6 +175,14 @@ def _usable(reference: str, kind: Kind, key: str) -> Any:
         if kind == "models" and key not in schema.model_fields:
             raise TypeError(f"{schema.__name__} has no field {key}")
     return schema
+
+
+def leave_out_undescribed() -> None:
+    """Leave out the sections that have no JSON Schema; for `nisus schema`, before it imports the schema of twins."""
+    for kind in SECTIONS:
+        for key, schema in [*schemas(kind).items()]:
+            if _tried(registered(kind)[key][0], schema.model_json_schema) is None:
+                del schemas(kind)[key]
 
 
 def maker(kind: Kind, key: str, asked: str = "", extra: str = "") -> Callable[..., Any]:

@@ -132,6 +132,9 @@ def outflow(x, u, p, out):
 
 def write_schema(arguments: SchemaCommand) -> int:
     """Write the JSON Schema of a twin's YAML."""
+    from config.extensions import leave_out_undescribed
+
+    leave_out_undescribed()
     from config.schema import json_schema_text
 
     text = json_schema_text()

@@ -3,10 +3,13 @@
 import json
 import shlex
 
+import pytest
+
 from app.twin.source import SOURCES
 from config.extensions import RESERVED, registered
 from config.model_schema import KINDS
 from config.output_schema import OutputsSection
+from config.schema import json_schema
 from tests import ROOT
 from tests.cases import cases
 from tests.support import run_python
@@ -15,7 +18,7 @@ NAME = "nisus_depth"
 
 MODULE = '''
 from dataclasses import dataclass
-from typing import Literal
+from typing import Callable, Literal
 
 from config.channels import MessagesSection
 from config.extensions import Extension, Part
@@ -99,6 +102,16 @@ def test_a_function_that_fails_is_one_line_for_who_asks_for_it(tmp_path, monkeyp
     code = f"from app.cli.main import main; raise SystemExit(main({shlex.split(words)}))"
     done = run(monkeypatch, installed(tmp_path, module, "depth = nisus_depth:EXTENSION"), code, status=2)
     assert done.stderr == f"nisus: extension depth: {text}\n"
+
+
+@pytest.mark.parametrize("kind", ["sources", "outputs", "models"])
+def test_a_section_without_a_json_schema_is_left_out_of_that_of_a_twin(tmp_path, monkeypatch, kind):
+    module = MODULE.replace("reading: float", "depth: Callable[[], int]").replace("sources=", f"{kind}=")
+    folder = installed(tmp_path, module, "depth = nisus_depth:EXTENSION")
+    done = run(monkeypatch, folder, "from app.cli.main import main; main(['schema'])")
+    reason = "PydanticInvalidForJsonSchema: Cannot generate a JsonSchema for core_schema.CallableSchema"
+    assert done.stderr == f"nisus: extension depth is left out: {reason}\n"
+    assert json.loads(done.stdout) == json_schema()
 
 
 def test_names_of_the_core_are_reserved():
