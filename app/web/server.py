@@ -22,7 +22,7 @@ from starlette.websockets import WebSocket
 
 from config.extensions import made, maker, registered
 from estimators.attribution import attribution
-from estimators.errors import ConfigError, EstimatorError, NisusError
+from estimators.errors import ConfigError, EstimatorError, NisusError, reason_of
 
 from ..charts.colors import EITHER, THEMES
 from ..charts.series import Series
@@ -42,7 +42,7 @@ from . import readings
 from .commands_json import command_from_json, commands_schema
 from .door import Door
 from .fit_api import FitApi
-from .http import PAGE, OneAtATime, get, openapi, page_file, post
+from .http import PAGE, OneAtATime, get, one_line, openapi, page_file, post, refusal
 from .request_threads import in_rerun_thread, in_thread
 from .runs_api import RunsApi
 from .streams import PageStream, feed_rerun
@@ -120,7 +120,7 @@ class PageServer:
         self._assets: Future[Path] = Future()
         self._explored, self._stopping = threading.Event(), threading.Event()
         self._viser = ViserProxy(viser_port, secret) if viser_port is not None else None
-        self.application = Starlette(routes=self._routes())
+        self.application = Starlette(routes=self._routes(), exception_handlers={Exception: self._failed})
 
     @property
     def url(self) -> str:
@@ -194,6 +194,15 @@ class PageServer:
                 Route("/viser/", self._viser.page),
             ]
         return [*routes, *made("routes", self._engine)]
+
+    async def _failed(self, request: Request, error: Exception) -> Response:
+        """Report an error of a route, which may be an extension's, and answer with it."""
+        path = request.url.path
+        owner, _ = registered("routes").get(path, ("", None))
+        place = f"extension {owner}: {path} of its routes" if owner else path
+        line = one_line(f"{place}: {reason_of(error)}")
+        self._engine.notices.report("request failed", line, level="error")
+        return refusal(ConfigError(line), 500)
 
     def _page(self, name: str) -> Response:
         settings = {"viewer": f"viewer/{viewer_version()}", "boot": self._boot, "viser": self._viser is not None}

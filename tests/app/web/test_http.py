@@ -17,8 +17,10 @@ from app.twin.twin import load_twin
 from app.web.commands_json import command_from_json
 from app.web.http import get, parse, post
 from app.web.streams import PageMessage
+from config.extensions import Part, registered
 from estimators.errors import ConfigError, NisusError
 from estimators.models import MODELS
+from tests.app.scripted import notice_texts
 from tests.cases import cases
 from tests.support import error_of
 
@@ -54,6 +56,19 @@ def test_a_body_becomes_arguments():
 def test_a_body_that_breaks_a_rule_is_refused(body, words):
     status, text = answer(post("/api/x", keep), body.encode())
     assert status == 400 and words in json.loads(text)["error"]
+
+
+def broken_route(engine):
+    return get("/api/depth", lambda: 1 // 0)
+
+
+def test_a_route_of_an_extension_that_fails_is_one_line(serve, monkeypatch):
+    monkeypatch.setitem(registered("routes"), "/api/depth", ("depth", Part("", f"{__name__}:broken_route")))
+    page = serve()
+    line = "extension depth: /api/depth of its routes: ZeroDivisionError: integer division or modulo by zero"
+    found = page.client.get("/api/depth")
+    assert (found.status, found.text) == (500, json.dumps({"error": line}, separators=(",", ":")))
+    assert line in notice_texts(page.engine)
 
 
 def test_a_message_may_leave_out_what_has_a_default():
