@@ -28,7 +28,7 @@ def as_html(text: str) -> str:
 NAME = "docs/alarms.md"
 
 PLACES = (
-    Path(__file__).resolve().parents[4] / NAME,
+    Path(__file__).resolve().parents[3] / NAME,
     Path(sysconfig.get_path("data")) / "share" / "nisus" / Path(NAME).name,
 )
 """In the checkout, or where an installation puts it."""
