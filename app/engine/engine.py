@@ -98,7 +98,7 @@ class Engine(Running):
         Raises:
             NisusError: If the source cannot be opened or the model does not compile.
         """
-        self._inbox: queue.SimpleQueue[Events | Delivery | Callable[[], Any]] = queue.SimpleQueue()
+        self._inbox: queue.SimpleQueue[Delivery | Callable[[], Any]] = queue.SimpleQueue()
         self._submitted: deque[Callable[[], Any]] = deque()
         """Commands and reloads that wait in the inbox; a fold is left unfinished for them."""
         self._workshop = workshop or Workshop()
@@ -354,9 +354,8 @@ class Engine(Running):
         mark = self._mark
         while item is not None:
             if isinstance(item, Delivery):
-                item, mark = item
-            if isinstance(item, Events):
-                batches.append(item)
+                batches.append(item.events)
+                mark = item.mark
                 if self._feeder.waits:
                     self._feeder.taken()
             else:

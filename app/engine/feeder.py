@@ -26,7 +26,7 @@ MAX_BATCHES_AHEAD = 32
 
 
 class Delivery(NamedTuple):
-    """Events of a source that counts what it has read: after them, its `mark`."""
+    """Events of a source, and its `mark` after them; 0 of a source that does not count what it has read."""
 
     events: Events
     mark: int
@@ -75,7 +75,10 @@ class Feeder:
         self._thread.stopping.set()
         self._room.release()
         self._thread.stop(2.0)
-        self.source.close()
+        try:
+            self.source.close()
+        except Exception as error:  # noqa: BLE001  as in `_run`; the rest of the twin ends too
+            self._report("source not closed", f"source cannot be closed: {reason_of(error)}")
 
     def taken(self) -> None:
         """Make room for one batch more."""
@@ -89,17 +92,12 @@ class Feeder:
             self._inbox.put(self._restarted)
         if batch is None:
             return None
-        mark = getattr(self.innermost, "mark", None)
-        if mark is not None:
-            if len(batch) or mark != self._mark:
-                if self.waits:
-                    self._room.acquire()
-                self._inbox.put(Delivery(batch, mark))
-            self._mark = mark
-        elif len(batch):
+        mark = getattr(self.innermost, "mark", 0)
+        if len(batch) or mark != self._mark:
             if self.waits:
                 self._room.acquire()
-            self._inbox.put(batch)
+            self._inbox.put(Delivery(batch, mark))
+        self._mark = mark
         return len(batch)
 
     @property

@@ -17,6 +17,7 @@ from app.engine import commands
 from app.engine.batches import BatchSizer
 from app.engine.engine import Engine
 from app.engine.failure_notices import Alerts
+from app.engine.feeder import Delivery
 from app.engine.jobs import Job
 from app.engine.notices import Notices
 from app.twin.twin import load_twin
@@ -258,8 +259,9 @@ def test_bad_commands_are_one_line_and_change_nothing(started):
     assert engine.tuning.get("R.winding") == 9.0 and texts and all("\n" not in text for text in texts)
 
 
-def test_a_live_source_that_fails_is_reopened(started):
+def test_a_live_source_that_fails_is_reopened_and_one_that_cannot_be_closed_is_a_notice(started):
     sources = [Scripted(live=True), Scripted(live=True)]
+    sources[1].close = lambda: 1 / 0
     engine = started(*sources)
     sources[0].put(readings([1.0], [40]))
     sources[0].put(OSError("bus off"))
@@ -267,6 +269,9 @@ def test_a_live_source_that_fails_is_reopened(started):
     wait_for(lambda: row_count(engine) == 2)
     assert any("bus off" in line.text for line in engine.notices.since(0))
     assert engine.notices.counts()["source reopened"] == 1
+    engine.stop()
+    (text,) = [line.text for line in engine.notices.since(0) if "closed" in line.text]
+    assert text == "source cannot be closed: ZeroDivisionError: division by zero"
 
 
 def test_after_the_end_of_the_source_the_estimate_can_still_be_retuned():
@@ -350,7 +355,7 @@ def test_measurements_that_wait_to_be_folded_are_age_and_health():
     assert stepped.status().health in USABLE
     for age, health in ((6.0, DEGRADED), (31.0, STALE)):
         ticks.since = time.monotonic() - age
-        engine._inbox.put(readings([11.0], [40.0]))
+        engine._inbox.put(Delivery(readings([11.0], [40.0]), 0))
         for status in (stepped.status(), engine.latest()):
             assert status.health == health and status.cause.startswith("the filter is behind: measurements of the last")
     engine.settle()
