@@ -3,15 +3,15 @@
 from __future__ import annotations
 
 import asyncio
-import threading
+import time
 from collections.abc import Callable
 from concurrent.futures import Future
 from contextlib import suppress
 from functools import partial
-from queue import SimpleQueue
 from typing import Any, TypeVar
 
-from ..engine.jobs import carry_out
+from ..engine.jobs import Jobs, carry_out
+from ..engine.notices import Notices
 
 T = TypeVar("T")
 
@@ -29,20 +29,13 @@ class RequestThreads:
 
     def __init__(self, name: str, count: int) -> None:
         """Prepare `count` threads of a name; nothing is started yet."""
-        self._name, self._count = name, count
-        self._queue: SimpleQueue[tuple[Future[Any], Callable[[], Any]]] = SimpleQueue()
-        self._lock = threading.Lock()
-        self._started = False
+        self._jobs = Jobs(Notices(time.time_ns), name, threads=count, niceness=0)
+        self._jobs.start()
 
     def submit(self, work: Callable[[], T]) -> Future[T]:
         """Queue work; the result or the error is set in the future."""
-        with self._lock:
-            if not self._started:
-                self._started = True
-                for k in range(self._count):
-                    threading.Thread(target=self._serve, name=f"{self._name} {k}", daemon=True).start()
         outcome: Future[T] = Future()
-        self._queue.put((outcome, work))
+        self._jobs.run("request", lambda job: carry_out(outcome, work))
         return outcome
 
     async def run(self, work: Callable[..., T], *arguments: Any, **named: Any) -> T:
@@ -54,10 +47,6 @@ class RequestThreads:
             with suppress(Exception):
                 await outcome
             raise
-
-    def _serve(self) -> None:
-        while True:
-            carry_out(*self._queue.get())
 
 
 in_thread = RequestThreads("request", REQUEST_THREADS).run
