@@ -25,10 +25,10 @@ from estimators.log import Log
 from estimators.snapshots import Base
 from estimators.tuning import Tuning
 
+from ..engine.engine import Engine
 from ..engine.history_copy import copy_log
 from ..engine.jobs import DONE, FAILED, RUNNING, Job, JobCancelled
 from ..engine.load_version import load_into
-from ..engine.running_fold import Running
 from ..format_time import format_time
 from ..twin.defaults import bounds_of, natural_aim, width_priors
 from ..twin.twin import with_held
@@ -87,7 +87,7 @@ class FitAttempt:
 class Fitting:
     """Fits on request, one at a time."""
 
-    def __init__(self, engine: Running) -> None:
+    def __init__(self, engine: Engine) -> None:
         self._engine = engine
         self._lock = threading.Lock()
         self.latest: FitAttempt | None = None
@@ -203,7 +203,7 @@ class LiveRefit:
 class Refits:
     """All fits of the windows of a running twin, the oldest first."""
 
-    def __init__(self, engine: Running) -> None:
+    def __init__(self, engine: Engine) -> None:
         """Nothing is fitted before `start`."""
         self._engine = engine
         self._fitting = Fitting(engine)

@@ -214,31 +214,28 @@ class Engine(Running):
         self._submit(partial(execute, command, self))
 
     def reload(self, twin: Twin, why: str, *, exact: bool = False) -> None:
-        """Queue a change to another twin; see `Running.reload`."""
+        """Queue a change to another twin of the same shape, or to the same one as it was saved anew.
+
+        Args:
+            twin: The new twin; `changes.obstacle` must have found no obstacle.
+            why: Reason of the new revision.
+            exact: Whether all its settings are taken; if not, settings changed on the page stay, unless the twin's
+                files changed them too.
+        """
         self._submit(partial(self._reload, twin, why, exact))
 
     def _submit(self, work: Callable[[], Any]) -> None:
         self._submitted.append(work)
         self._inbox.put(lambda: self._submitted.popleft()())
 
-    @property
-    def source(self) -> Source:
-        """The source of the measurements; it may be reopened."""
-        return self._feeder.source
-
-    @property
-    def innermost(self) -> Any:
-        """The source itself, also if faults are injected into it."""
-        return self._feeder.innermost
-
     def options_of(self, estimator: str) -> Mapping[str, float]:
-        """Return the options with which an estimator starts."""
+        """See `Running`."""
         if estimator == self.estimator:
             return self.tuning.options
         return self._last_options.get(estimator, self.twin.options_of(estimator))
 
     def episodes(self) -> list[Episode]:
-        """Return all episodes in the order of their start."""
+        """Return all episodes in the order of their start; at most a second behind the rows."""
         return self._watchers.episodes()
 
     def tracked_episodes(self) -> tuple[TrackedEpisode, ...]:
@@ -246,11 +243,11 @@ class Engine(Running):
         return self._watchers.episode_log.summary.entries
 
     def status_at(self, t: int) -> Status:
-        """See `Running`."""
+        """Return the status with health, sensors, episodes and NIS as they were at a time, ns."""
         return past_status(self, self._watchers, t)
 
     def status(self) -> Status:
-        """Return the status."""
+        """See `Running`."""
         last = self._status
         if last is not None and time.monotonic() - last[0] < STATUS_PERIOD_S:
             return self._with_lag(last[1])
@@ -282,7 +279,7 @@ class Engine(Running):
         return replace(status, health=health, since=since, cause=cause, sensors=sensors)
 
     def latest(self) -> Status:
-        """See `Running`."""
+        """Return the status with time, estimate, inputs and health of the newest row; the rest may be 0.1 s old."""
         status = self.status()
         with self._reading(STATUS_TIMEOUT_S) as still:
             fold, last = self._fold, self._fold.n - 1

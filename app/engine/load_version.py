@@ -6,10 +6,10 @@ from estimators.errors import ConfigError
 
 from ..twin.changes import obstacle
 from ..twin.twin import with_version
-from .running_fold import Running
+from .engine import Engine
 
 
-def load_into(engine: Running, name: str, why: str | None = None) -> None:
+def load_into(engine: Engine, name: str, why: str | None = None) -> None:
     """Queue the change to a version of the twin, or to `own`; the history is folded again with it.
 
     `why` is the reason of the new run; None for the version's name.

@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING, Any, Protocol
 import numpy as np
 
 from estimators.diagnostics.considered_shares import considered_pairs
-from estimators.diagnostics.episodes import Episode, TrackedEpisode
+from estimators.diagnostics.episodes import TrackedEpisode
 from estimators.diagnostics.references import withheld
 from estimators.errors import EstimatorError
 from estimators.fold import Fold
@@ -25,9 +25,9 @@ from estimators.tuning import Tuning
 from sources.source import Source
 
 from .batches import BatchSizer, FairLock, Requests
-from .commands import Command
 from .copies import AlertMute, Belief, Cursor, EventWindow, Here, LogTail, Pull, Status, event_window
 from .counts import RowCounts
+from .feeder import Feeder
 from .jobs import Jobs
 from .notices import Annotation, Annotations, Audit, AuditEntry, Notices
 from .outcomes import Outcomes
@@ -119,6 +119,7 @@ class Running(ABC):
     store: Keeper | None
     outcomes: Outcomes
     """What became of messages that were sent to it."""
+    _feeder: Feeder
 
     def __init__(
         self,
@@ -184,6 +185,16 @@ class Running(ABC):
                 self._lock.release()
 
     # From any thread
+
+    @property
+    def source(self) -> Source:
+        """The source of the measurements; it may be reopened."""
+        return self._feeder.source
+
+    @property
+    def innermost(self) -> Any:
+        """The source itself, also if faults are injected into it."""
+        return self._feeder.innermost
 
     def cursor(self, *, follows_log: bool = False, span: int | None = None) -> Cursor:
         """Return a cursor of one consumer for `pull`, to be given back with `release`; for the options see `Cursor`."""
@@ -383,50 +394,9 @@ class Running(ABC):
 
     # Added by the engine
 
-    @property
-    @abstractmethod
-    def source(self) -> Source:
-        """The source of the measurements; it may be reopened."""
-
-    @abstractmethod
-    def submit(self, command: Command) -> None:
-        """Queue a command."""
-
-    @abstractmethod
-    def reload(self, twin: Twin, why: str, *, exact: bool = False) -> None:
-        """Queue a change to another twin of the same shape, or to the same one as it was saved anew.
-
-        Args:
-            twin: The new twin; `changes.obstacle` must have found no obstacle.
-            why: Reason of the new revision.
-            exact: Whether all its settings are taken; if not, settings changed on the page stay, unless the twin's
-                files changed them too.
-        """
-
     @abstractmethod
     def status(self) -> Status:
         """Return the status, computed at most ten times per second; during a refold usually the previous one."""
-
-    @abstractmethod
-    def latest(self) -> Status:
-        """Return the status with time, estimate, inputs and health of the newest row; the rest may be 0.1 s old."""
-
-    @abstractmethod
-    def status_at(self, t: int) -> Status:
-        """Return the status with health, sensors, episodes and NIS as they were at a time, ns."""
-
-    @abstractmethod
-    def episodes(self) -> list[Episode]:
-        """Return all episodes in the order of their start; at most a second behind the rows."""
-
-    @abstractmethod
-    def tracked_episodes(self) -> tuple[TrackedEpisode, ...]:
-        """Return the same with their keys, for the store."""
-
-    @property
-    @abstractmethod
-    def innermost(self) -> Any:
-        """The source itself, also if faults are injected into it."""
 
     @abstractmethod
     def options_of(self, estimator: str) -> Mapping[str, float]:

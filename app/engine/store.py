@@ -33,6 +33,7 @@ from ..format_time import counted, duration_text, format_time
 from ..twin.changes import difference, merged, shape
 from ..twin.twin import VERSION, Twin, restore_twin, with_version
 from .copies import LogTail
+from .engine import Engine
 from .fold_json import (
     base_from_json,
     base_to_json,
@@ -44,7 +45,7 @@ from .fold_json import (
 from .jobs import Job, Jobs
 from .notices import MAX_COMMANDS, Annotation, AuditEntry
 from .revisions import Revision
-from .running_fold import Running, StoredTwin
+from .running_fold import StoredTwin
 
 FORMAT = 2
 APPLICATION_ID = 0x4E697375
@@ -451,7 +452,7 @@ def continued_text(path: Path, stored: StoredTwin, now: float) -> str:
 class StoreWriter:
     """Writes a running twin into its store, in a repeated job."""
 
-    def __init__(self, engine: Running, store: Store, stored: StoredTwin | None) -> None:
+    def __init__(self, engine: Engine, store: Store, stored: StoredTwin | None) -> None:
         """Begin with the content of the store, which the engine has not changed yet."""
         self._engine, self._store = engine, store
         self._cursor = engine.cursor(follows_log=True)

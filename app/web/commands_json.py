@@ -13,8 +13,8 @@ from pydantic import TypeAdapter
 from estimators.errors import ConfigError, nearest
 
 from ..engine import commands
+from ..engine.engine import Engine
 from ..engine.execute import prepared
-from ..engine.running_fold import Running
 from .http import parse, shown
 
 MAX_NAME_BYTES = 255
@@ -23,7 +23,7 @@ MAX_NAME_BYTES = 255
 COMMANDS = {kind.__name__: kind for kind in typing.get_args(commands.Command)}
 
 
-def command_from_json(body: Any, engine: Running) -> commands.Command:
+def command_from_json(body: Any, engine: Engine) -> commands.Command:
     """Return the command of `{"command": NAME, field: value, ...}`.
 
     Raises:

@@ -10,9 +10,9 @@ from starlette.routing import Route
 from estimators.errors import ConfigError
 
 from ..derive.refits import FITTING, STOPPING, FitAttempt, Fitting, LiveRefit, Refits
+from ..engine.engine import Engine
 from ..engine.history_copy import copy_log
 from ..engine.jobs import Job
-from ..engine.running_fold import Running
 from ..twin.versions import keep, settings_of, version_text
 from .http import get, one_line, post
 from .runs_api import checked_note
@@ -26,7 +26,7 @@ if TYPE_CHECKING:
 class FitApi:
     """Routes for fits and advice, and the work behind them."""
 
-    def __init__(self, engine: Running, refits: Refits) -> None:
+    def __init__(self, engine: Engine, refits: Refits) -> None:
         self._engine, self._refits = engine, refits
         self.fitting = Fitting(engine)
         self._advising = Advising(engine)
@@ -169,7 +169,7 @@ def _result_json(fitted: Fitted) -> dict[str, Any]:
 class Advising:
     """Measures one log at a time and keeps the last result with its `revision`."""
 
-    def __init__(self, engine: Running) -> None:
+    def __init__(self, engine: Engine) -> None:
         self._engine = engine
         self._job: Job | None = None
         self._progress: AdviceProgress | None = None

@@ -24,10 +24,10 @@ from ..charts.chart_stream import Seconds
 from ..charts.series import Series
 from ..derive.run_scores import RunScores
 from ..derive.sweep import Sweeps, noise
+from ..engine.engine import Engine
 from ..engine.history_copy import copy_log
 from ..engine.load_version import load_into
 from ..engine.revisions import MAX_NOTE_LENGTH, Revision
-from ..engine.running_fold import Running
 from ..render.html import to_html
 from ..render.report import Reported, report
 from ..render.runs_json import changes_json, noise_json, runs_json, swept_json, what_changed
@@ -55,7 +55,7 @@ register_url_convertor("run", RunNumber())
 class RunsApi:
     """Routes for runs and tuning versions. Scores and sweeps are computed on request."""
 
-    def __init__(self, engine: Running, series: Series) -> None:
+    def __init__(self, engine: Engine, series: Series) -> None:
         self._engine, self._series = engine, series
         self.scores = RunScores(engine)
         self._sweeps = Sweeps(engine)
@@ -225,7 +225,7 @@ def _scored(scores: RunScores) -> tuple[tuple[str, ...], ...]:
     return tuple(lines)
 
 
-def commission_running(engine: Running, *, force: bool) -> Path:
+def commission_running(engine: Engine, *, force: bool) -> Path:
     """Write the baseline of the running tuning over its whole history into the twin's file; return the file.
 
     Raises:

@@ -29,12 +29,11 @@ from ..charts.series import Series
 from ..derive.diagnosis import Diagnosis
 from ..derive.forecast import Forecasts, question_from_json
 from ..derive.refits import Refits
-from ..engine.engine import STATUS_PERIOD_S
+from ..engine.engine import STATUS_PERIOD_S, Engine
 from ..engine.faults import catalogue_json
 from ..engine.outputs.alarm_guide import alarms_text, as_html
 from ..engine.outputs.alerts import alert_schema
 from ..engine.outputs.state_message import StateMessage, state_message, state_schema
-from ..engine.running_fold import Running
 from ..result import plain
 from ..study.why import why_json
 from ..terminal import messages_file
@@ -82,7 +81,7 @@ class PageServer:
 
     def __init__(
         self,
-        engine: Running,
+        engine: Engine,
         *,
         port: int | Door,
         viser_port: int | None,

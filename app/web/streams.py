@@ -20,7 +20,7 @@ from estimators.errors import ConfigError, nearest
 
 from ..charts.chart_stream import ChartQuery, ChartStream, Seconds
 from ..charts.series import Series
-from ..engine.running_fold import Running
+from ..engine.engine import Engine
 from .http import MAX_BODY_BYTES, one_line, parse
 from .request_threads import in_rerun_thread, in_thread
 from .twin_json import annotations_json, episodes_json, moment_json
@@ -84,7 +84,7 @@ class PageStream:
     """Serves one page: JSON in text messages, frames of its chart streams in binary ones."""
 
     def __init__(
-        self, browser: WebSocket, engine: Running, series: Series, status: Callable[[], dict[str, Any]], boot: str,
+        self, browser: WebSocket, engine: Engine, series: Series, status: Callable[[], dict[str, Any]], boot: str,
         choices: Choices | None = None,
     ) -> None:  # fmt: skip
         self._browser, self._engine, self._series, self._status = browser, engine, series, status
@@ -272,7 +272,7 @@ def changes(before: dict[str, Any], now: dict[str, Any]) -> dict[str, Any]:
     return ({"status": news} if news or entries else {}) | ({"entries": entries} if entries else {})
 
 
-def belief_json(engine: Running, pair: list[int], at: int | None = None) -> dict[str, Any] | None:
+def belief_json(engine: Engine, pair: list[int], at: int | None = None) -> dict[str, Any] | None:
     """Return mean (2), covariance [a, b, c] of [[a, b], [b, c]] and particles (k, 2); None while not finite.
 
     `at` is a time, ns; None is the present.

@@ -22,7 +22,7 @@ from .alarm_guide import advice
 from .state_message import StateMessage, iso_now
 
 if TYPE_CHECKING:
-    from ..running_fold import Running
+    from ..engine import Engine
 
 SCHEMA: Literal["nisus.alert/1"] = "nisus.alert/1"
 
@@ -80,7 +80,7 @@ class Finding(NamedTuple):
     key: str = ""
 
 
-def findings(rule: AlertSection, engine: Running, message: StateMessage) -> Iterator[Finding]:
+def findings(rule: AlertSection, engine: Engine, message: StateMessage) -> Iterator[Finding]:
     """Yield the conditions of a rule that hold for a state."""
     if rule.health is not None and HEALTH_NAMES.index(message.health) >= HEALTH_NAMES.index(rule.health):
         leading = next((item for item in engine.episodes() if item.end is None and item.text == message.cause), None)
@@ -169,7 +169,7 @@ class AlertRules:
         """Alerts that were sent and are not resolved, oldest first."""
         return tuple(item for item in self._open.copy().values() if item.sent is not None)
 
-    def look(self, engine: Running, message: StateMessage) -> list[tuple[AlertSection, AlertMessage]]:
+    def look(self, engine: Engine, message: StateMessage) -> list[tuple[AlertSection, AlertMessage]]:
         """Return the messages to send now, each with its rule.
 
         Conditions of an estimate that is not known, because the state is waiting, neither begin nor end.

@@ -29,7 +29,7 @@ from .state_message import StateMessage, state_message
 if TYPE_CHECKING:
     from config.schema import TwinSection
 
-    from ..running_fold import Running
+    from ..engine import Engine
 
 ALIVE_PERIOD_S = 1.0
 """Between two messages of a state that does not change: its age does."""
@@ -76,7 +76,7 @@ class Parts(NamedTuple):
 class Publisher:
     """Outputs and alerts of one running twin, as its YAML asks for them."""
 
-    def __init__(self, engine: Running, *, page: str | None = None, store: Path | None = None) -> None:
+    def __init__(self, engine: Engine, *, page: str | None = None, store: Path | None = None) -> None:
         """Prepare; nothing is connected yet.
 
         Args:

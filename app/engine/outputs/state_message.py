@@ -19,7 +19,7 @@ from estimators.diagnostics.sensitivity import Bound
 from estimators.model.parts import State
 from estimators.track import DEGRADED, DIVERGED, GATED, HEALTH_NAMES, MISSING, SUSPECT, USABLE, USED
 
-from ..running_fold import Running
+from ..engine import Engine
 
 SCHEMA: Literal["nisus.state/1"] = "nisus.state/1"
 
@@ -106,7 +106,7 @@ class StateMessage(_Part):
     covariance_of: tuple[Name, ...] | None
 
 
-def state_message(engine: Running, *, covariance: bool = False) -> StateMessage:
+def state_message(engine: Engine, *, covariance: bool = False) -> StateMessage:
     """Return the present state of a running twin; with `covariance`, P of all states of the filter."""
     status, model = engine.latest(), engine.model
     tuning, cause = status.tuning, status.cause

@@ -9,8 +9,8 @@ import numpy as np
 from starlette.responses import Response
 from starlette.routing import BaseRoute
 
+from app.engine.engine import Engine
 from app.engine.outputs.state_message import state_message
-from app.engine.running_fold import Running
 from app.web.http import get, refusal
 from estimators.errors import ConfigError
 from estimators.track import HEALTH_NAMES, VERDICT_NAMES
@@ -22,7 +22,7 @@ if TYPE_CHECKING:
 class TwinCollector:
     """Metrics of one twin, made anew for each scrape."""
 
-    def __init__(self, engine: Running, *, states: bool) -> None:
+    def __init__(self, engine: Engine, *, states: bool) -> None:
         """`states`: also one series per state, which a large twin has thousands of."""
         self._engine, self._states = engine, states
 
@@ -103,7 +103,7 @@ class TwinCollector:
         yield from (alerts, waiting)
 
 
-def metrics_route(engine: Running) -> BaseRoute:
+def metrics_route(engine: Engine) -> BaseRoute:
     """Return the route of the metrics of a running twin."""
 
     def metrics(states: bool = False) -> Response:
