@@ -80,10 +80,11 @@ class FitApi:
 
     def _advice(self) -> Any:
         """Return the advice, or the state of its search."""
-        found = self._advising
+        found, job = self._advising, self._advising.job
         current = found.revision == self._engine.revisions.runs[-1].number
-        state = {"state": found.state, "revision": found.revision, "current": current, "reason": one_line(found.reason)}
-        return state | {"progress": found.progress()} | ({"advice": found.advice} if found.advice else {})
+        state, reason = ("none", "") if job is None else (job.state, one_line(job.reason))
+        known = {"state": state, "revision": found.revision, "current": current, "reason": reason}
+        return known | {"progress": found.progress()} | ({"advice": found.advice} if found.advice else {})
 
     def _advise(self) -> Any:
         """Begin to search the estimator that suits the log."""
@@ -92,7 +93,8 @@ class FitApi:
 
     def _cancel_advice(self) -> Any:
         """Cancel the search; the advice before it stays."""
-        self._advising.cancel()
+        if self._advising.job is not None:
+            self._advising.job.cancel()
         return self._advice()
 
     # Dual estimation
@@ -171,25 +173,16 @@ class Advising:
 
     def __init__(self, engine: Engine) -> None:
         self._engine = engine
-        self._job: Job | None = None
+        self.job: Job | None = None
+        """The last measurement."""
         self._progress: AdviceProgress | None = None
         self.advice: dict[str, Any] = {}
         """The last advice as JSON; a cancelled one leaves the one before."""
         self.revision: int | None = None
 
-    @property
-    def state(self) -> str:
-        """That of the job, or "none"."""
-        return "none" if self._job is None else self._job.state
-
-    @property
-    def reason(self) -> str:
-        """Why it failed."""
-        return "" if self._job is None else self._job.reason
-
     def progress(self) -> dict[str, Any]:
         """Return the question that is being answered, the share done, and the seconds spent and left, about."""
-        job, progress = self._job, self._progress
+        job, progress = self.job, self._progress
         if job is None or progress is None:
             return {"question": "", "share": None, "elapsed": 0.0, "left": None}
         share = progress.done / progress.expected if progress.expected else None
@@ -200,11 +193,6 @@ class Advising:
             "left": progress.left(job.elapsed),
         }
 
-    def cancel(self) -> None:
-        """Cancel the measurement; it ends after its current fold."""
-        if self._job is not None:
-            self._job.cancel()
-
     def begin(self) -> None:
         """Measure the log.
 
@@ -212,7 +200,7 @@ class Advising:
             ConfigError: If it is being measured, or measuring would hold up the running twin.
         """
         engine = self._engine
-        if self._job is not None and not self._job.over:
+        if self.job is not None and not self.job.over:
             raise ConfigError("advice: the log is being measured; wait for it")
         if engine.model.black_box:
             raise ConfigError(f"advice: {engine.model.name} is a black box, too slow to be measured; use nisus advise")
@@ -220,7 +208,7 @@ class Advising:
             # Compiling holds the interpreter.
             raise ConfigError("advice: the filters that it compares are still being compiled; ask again then")
         self._progress = None
-        self._job = engine.jobs.run("advice", self.measure, failed=lambda reason: None)
+        self.job = engine.jobs.run("advice", self.measure, failed=lambda reason: None)
 
     def measure(self, job: Job) -> dict[str, Any]:
         """Return the advice on a copy of the log, as JSON."""
