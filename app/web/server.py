@@ -33,6 +33,7 @@ from ..engine.engine import STATUS_PERIOD_S, Engine
 from ..engine.faults import catalogue_json
 from ..engine.outputs.alarm_guide import alarms_text, as_html
 from ..engine.outputs.alerts import alert_schema
+from ..engine.outputs.publisher import ALIVE_PERIOD_S
 from ..engine.outputs.state_message import StateMessage, state_message, state_schema
 from ..result import plain
 from ..study.why import why_json
@@ -64,9 +65,6 @@ NOT_PUBLISHED: dict[str, Any] = {
     "outputs": [], "receivers": [], "alerts": [], "muted_s": 0.0, "mute_reason": "",
 }  # fmt: skip
 """Of a recording, which is published nowhere."""
-
-HEARTBEAT_S = 1.0
-"""Between two messages of a state that does not change: its age does."""
 
 IMMUTABLE = "public, max-age=31536000, immutable"
 MEDIA_TYPES = {".js": "text/javascript", ".wasm": "application/wasm"}
@@ -357,7 +355,7 @@ class PageServer:
             while not self._stopping.is_set() and not await request.is_disconnected():
                 found = await in_thread(state_message, self._engine)
                 new, now = (found.time_ns, found.revision, found.health, found.cause), time.monotonic()
-                if new != sent or now - at >= HEARTBEAT_S:
+                if new != sent or now - at >= ALIVE_PERIOD_S:
                     sent, at = new, now
                     yield f"event: state\nid: {found.revision}:{found.time_ns}\ndata: {found.model_dump_json()}\n\n"
                 await asyncio.sleep(STATUS_PERIOD_S)

@@ -9,7 +9,7 @@ import hashlib
 import math
 import time
 from collections.abc import Callable, Iterator, Sequence
-from typing import TYPE_CHECKING, Any, Literal, NamedTuple, Protocol, TypeVar
+from typing import TYPE_CHECKING, Any, Literal, NamedTuple
 
 from pydantic import BaseModel, ConfigDict, Field
 
@@ -119,21 +119,9 @@ def tail(over: float, std: float) -> float:
     return 0.5 * math.erfc(-over / (std * math.sqrt(2.0)))
 
 
-class Titled(Protocol):
-    """A rule for alerts, of a twin or of many assets."""
-
-    @property
-    def title(self) -> str:
-        """Name of the rule, or its condition."""
-
-
-Rule = TypeVar("Rule", bound=Titled)
-
-
-def numbered(rules: Sequence[Rule]) -> dict[tuple[str, str], Rule]:
-    """Return rules by their number among those of the same title, and title."""
-    titles = [rule.title for rule in rules]
-    return {(str(titles[:k].count(rule.title)), rule.title): rule for k, rule in enumerate(rules)}
+def numbered(titles: Sequence[str]) -> list[tuple[str, str]]:
+    """Return the titles of rules, each after its number among equal ones."""
+    return [(str(titles[:k].count(title)), title) for k, title in enumerate(titles)]
 
 
 class OpenAlert:
@@ -159,7 +147,8 @@ class AlertRules:
         self, rules: Sequence[AlertSection], *, link: str | None = None, clock: Callable[[], float] = time.monotonic
     ) -> None:
         """`link`: address of the page, without the token; `clock` returns seconds."""
-        self._rules, self._link, self._clock = numbered(rules), link, clock
+        self._rules = dict(zip(numbered([rule.title for rule in rules]), rules, strict=True))
+        self._link, self._clock = link, clock
         self._open: dict[tuple[str, ...], OpenAlert] = {}
         self._version: int | None = None
         self._maintained = -math.inf

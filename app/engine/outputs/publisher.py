@@ -109,11 +109,6 @@ class Publisher:
         self._end()
         self._store.close(self._parts.rules, self._parts.deliveries)
 
-    @property
-    def outputs(self) -> tuple[Output, ...]:
-        """Outputs that publish at present."""
-        return self._parts.outputs
-
     def json(self) -> dict[str, Any]:
         """Return the state of outputs, receivers and alerts."""
         parts, mute = self._parts, self._engine.mute
@@ -160,7 +155,7 @@ class Publisher:
         if parts.deliveries.queues:
             self.problem = self._store.open(parts.rules, parts.deliveries)
             parts.jobs.run("alerts", lambda job: self._look(parts), every=RULES_PERIOD_S)
-        parts.deliveries.run(parts.jobs, RULES_PERIOD_S)
+        parts.deliveries.run(parts.jobs)
         parts.jobs.start()
 
     def _end(self) -> None:

@@ -280,10 +280,10 @@ class Deliveries:
                 self._beats[name] = now
                 self.queues[name].put(heartbeat(twin, health))
 
-    def run(self, jobs: Jobs, every: float) -> None:
+    def run(self, jobs: Jobs) -> None:
         """Deliver in threads of a pool."""
         for queue in self.queues.values():
-            jobs.run(f"alerts to {queue.name}", queue.step, every=every)
+            jobs.run(f"alerts to {queue.name}", queue.step, every=DELIVERY_PERIOD_S)
 
 
 def make_receivers(

@@ -187,7 +187,7 @@ class FleetRules:
     ) -> None:
         """`fleet`: its name; `link`: address of the overview, without the token; `clock` returns seconds."""
         self._make, self._clock = partial(FleetRule, fleet=fleet, link=link), clock
-        self._rules = {name: self._make(rule) for name, rule in numbered(rules).items()}
+        self._rules = dict(zip(numbered([rule.title for rule in rules]), map(self._make, rules), strict=True))
 
     def look(self, names: Sequence[str], table: FleetTable) -> list[tuple[FleetAlertSection, FleetAlertMessage]]:
         """Return the messages to send now, each with its rule."""

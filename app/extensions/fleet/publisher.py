@@ -28,8 +28,8 @@ if TYPE_CHECKING:
 HEALTH_RULE = FleetAlertSection(health="degraded")
 """Rule of a fleet that has receivers and no rules."""
 
-DELIVERY_PERIOD_S, POLL_S = 0.2, 0.002
-"""Between two looks at the queues of receivers, and at a connection that takes no state."""
+POLL_S = 0.002
+"""Between two looks at a connection that takes no state."""
 
 
 class FleetPublisher:
@@ -74,7 +74,7 @@ class FleetPublisher:
             return
         if self._deliveries.queues:
             self._store.open(self._rules, self._deliveries)
-        self._deliveries.run(self._jobs, DELIVERY_PERIOD_S)
+        self._deliveries.run(self._jobs)
         self._jobs.start()
         self._thread.start()
 

@@ -77,7 +77,7 @@ def test_a_twin_that_is_cut_off_is_told_by_the_broker(serve, broker, listener):
     page = published(serve, broker)
     wait_for(lambda: listener.of(f"{ROOT}/status"))
     # As with a process that is killed: the socket ends without a farewell.
-    (mqtt,) = page.engine.published.outputs
+    (mqtt,) = page.engine.published._parts.outputs
     mqtt.client.socket().shutdown(2)
     wait_for(lambda: [m["online"] for m in listener.of(f"{ROOT}/status")][:2] == [True, False])
     page.engine.published.stop()
