@@ -13,12 +13,9 @@ from estimators.numerics.linalg import wrapped
 from estimators.track import estimated_rows
 
 from ..columns import Column, Rows
-from ..engine.copies import Cursor, Pull
+from ..engine.copies import MAX_PULL_ROWS, Cursor, Pull
 from ..engine.running_fold import Running
 from .levels_of_detail import FIRST, Groups, Pyramid, grouped
-
-ROWS = 16_384
-"""Rows pulled at once, so that a long history does not hold the engine's lock for long."""
 
 
 class RowSource(Protocol):
@@ -114,7 +111,7 @@ class ChartedRun:
             self._cursor = self.source.cursor()
         self.changed = self.end
         while True:
-            pull = self._taken(self.source.pull(self._cursor, ROWS, align=FIRST))
+            pull = self._taken(self.source.pull(self._cursor, MAX_PULL_ROWS, align=FIRST))
             if pull.fresh:
                 self.levelled = sorted(columns)
                 self._pyramid = Pyramid(len(self.levelled))
@@ -124,7 +121,7 @@ class ChartedRun:
                 self._pyramid.update(pull.first, pull.events.t, self._values(pull, self.levelled))
                 self.changed = min(self.changed, pull.changed)
             self.end = pull.first + len(pull.events)
-            if len(pull.events) < ROWS:
+            if len(pull.events) < MAX_PULL_ROWS:
                 self._pyramid.forget(pull.oldest)
                 return
 
@@ -149,14 +146,14 @@ class ChartedRun:
         Returns:
             Times (k, count), ns, ascending; values (k, count, columns), NaN where a group has no such measurement.
         """
-        part = min(groups.size, ROWS)
+        part = min(groups.size, MAX_PULL_ROWS)
         each = max(1, count * part // groups.size)
         n = groups.n * (groups.size // part)
         times, values = np.zeros((n, each), np.int64), np.full((n, each, len(columns)), np.nan)
         origin = groups.start * groups.size
         stop = min(origin + n * part, self.end)
-        for start in range(origin, stop, ROWS):
-            pull = self.source.rows(start, min(start + ROWS, stop))
+        for start in range(origin, stop, MAX_PULL_ROWS):
+            pull = self.source.rows(start, min(start + MAX_PULL_ROWS, stop))
             rows = np.flatnonzero(pull.events.kind == READING)
             index = pull.first + rows
             of = (index - origin) // part
@@ -199,8 +196,8 @@ def _mixed(index: np.ndarray) -> np.ndarray:
 def less(pull: Pull, engine: Running) -> Pull:
     """Return rows with means less those of the running fold, NaN where it has no such row."""
     mean = np.full_like(pull.track.mean, np.nan)
-    for start in range(0, len(mean), ROWS):
-        live = engine.rows(pull.first + start, pull.first + min(start + ROWS, len(mean)))
+    for start in range(0, len(mean), MAX_PULL_ROWS):
+        live = engine.rows(pull.first + start, pull.first + min(start + MAX_PULL_ROWS, len(mean)))
         at = live.first - pull.first
         rows = slice(at, at + len(live.events))
         # The log may have begun again: a row of the same number at another time is another.

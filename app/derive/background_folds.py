@@ -21,7 +21,7 @@ from estimators.log import Log
 from estimators.pieces import SMOOTHER
 from estimators.smoothing.smooth import check_smooth, smooth
 
-from ..engine.copies import Cursor, Pull
+from ..engine.copies import MAX_PULL_ROWS, Cursor, Pull
 from ..engine.jobs import Job
 from ..engine.revisions import Revision
 from ..engine.running_fold import Running
@@ -29,9 +29,6 @@ from ..engine.workshop import Workshop
 
 POLL_PERIOD_S = 0.1
 """Between two looks for new events."""
-
-PULL_EVENTS = 4096
-"""Events taken at once."""
 
 CHUNK_EVENTS = 64
 """Events folded at once while readers wait."""
@@ -112,7 +109,7 @@ class PinnedFold:
 
     def follow(self, job: Job) -> float:
         """Fold new events; return the seconds until the next look."""
-        pull = self._engine.pull(self._cursor, PULL_EVENTS)
+        pull = self._engine.pull(self._cursor, MAX_PULL_ROWS)
         if pull.fresh and not self._begin(pull):
             return POLL_PERIOD_S
         assert self._fold is not None
@@ -142,7 +139,7 @@ class PinnedFold:
                 log.drop_front(count)
         kept = self.run.track
         self.caught_up |= kept is None or log.first + fold.n >= kept.first + len(kept.events)
-        return 0.0 if len(pull.events) == PULL_EVENTS else POLL_PERIOD_S
+        return 0.0 if len(pull.events) == MAX_PULL_ROWS else POLL_PERIOD_S
 
     def _begin(self, pull: Pull) -> bool:
         """Start a fold where the engine's starts, also after the log has begun again; False if that has just moved."""

@@ -17,14 +17,13 @@ from estimators.model.state_space import LARGE
 from estimators.registry import find_entry
 from estimators.track import Track
 
-from ..engine.copies import EventWindow, Status
+from ..engine.copies import MAX_PULL_ROWS, EventWindow, Status
 from ..engine.fault_monitors import reason_against
 from ..engine.jobs import Job, PacedExecutor
 from ..engine.running_fold import Running
 from .row_figures import listed, number, rows_json
 
 DIAGNOSED_ROWS = 20_000  # last rows that are analysed
-COPY_ROWS = 4096  # rows that are copied at once: the engine waits for no more
 REUSE_S = 1.0  # seconds for which an answer is reused, for all clients
 LINE_POINTS = 200  # points of a line over time
 MAX_CORRELATED_STATES = 48  # states of a correlation map
@@ -154,8 +153,8 @@ def last_rows(engine: Running, most: int) -> tuple[int, Events, Track]:
     """
     end = engine.end()
     pieces = [engine.rows(end - most, end - most)]
-    for start in range(max(0, end - most), end, COPY_ROWS):
-        piece = engine.rows(start, min(start + COPY_ROWS, end))
+    for start in range(max(0, end - most), end, MAX_PULL_ROWS):
+        piece = engine.rows(start, min(start + MAX_PULL_ROWS, end))
         if piece.revision != pieces[0].revision:
             return last_rows(engine, most)
         pieces.append(piece)

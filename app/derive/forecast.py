@@ -15,7 +15,7 @@ from estimators.forecast import Crossing, Forecast, first_time, forecast
 from estimators.log import INPUT, Events
 from estimators.model.state_space import StateSpaceModel
 
-from ..engine.copies import Here
+from ..engine.copies import MAX_PULL_ROWS, Here
 from ..engine.running_fold import Running
 from .row_figures import listed, number
 
@@ -233,7 +233,6 @@ REPEAT = "repeat"  # in place of an input's values: those that it had before
 Changes = list[tuple[float, float]]  # changes of one input: seconds from now, and the value from then on
 MAX_STEPS = 20_000  # steps of a forecast; each is as long as the time between measurements
 MAX_TIMES = 160  # times in the answer
-COPY_ROWS = 16_384  # rows copied at once, so that a long history does not hold the engine's lock for long
 
 
 def recorded(engine: Running, names: Sequence[str], now: int, horizon: float) -> dict[str, Changes]:
@@ -251,10 +250,10 @@ def recorded(engine: Running, names: Sequence[str], now: int, horizon: float) ->
     before: dict[str, float] = {}
     found: dict[str, Changes] = {name: [] for name in names}
     # From some rows before, for what held at first.
-    at, end = max(0, engine.index_at(since) - COPY_ROWS), engine.index_at(now + 1)
+    at, end = max(0, engine.index_at(since) - MAX_PULL_ROWS), engine.index_at(now + 1)
     while at < end:
-        events = engine.rows(at, min(end, at + COPY_ROWS)).events
-        at += COPY_ROWS
+        events = engine.rows(at, min(end, at + MAX_PULL_ROWS)).events
+        at += MAX_PULL_ROWS
         for row in np.flatnonzero(events.kind == INPUT):
             for name, place in places.items():
                 value = float(events.value[row, place])

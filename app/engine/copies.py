@@ -26,6 +26,9 @@ from sources.faults.layer import FaultStatus
 
 from .notices import Notice
 
+MAX_PULL_ROWS = 16_384
+"""Rows copied at once, so that a long history does not hold the engine's lock for long."""
+
 
 @dataclass
 class Cursor:

@@ -22,7 +22,7 @@ from estimators.track import ADVISORY, DIVERGED, HEALTH_NAMES, TRACKING, WAITING
 
 from ..format_time import duration_text
 from ..leading import leading, severity
-from .copies import Pull
+from .copies import MAX_PULL_ROWS, Pull
 from .counts import last_run
 from .jobs import Job
 from .running_fold import Running
@@ -32,9 +32,6 @@ EPISODES_PERIOD_S, MAX_EPISODES_PERIOD_S = 0.4, 3.0
 
 PROCESSOR_SHARE = 0.05
 """Share of a processor that updates may take: expensive ones come less often."""
-
-PULLED_ROWS = 8192
-"""Rows pulled at once, so that the engine's lock is not held for long."""
 
 MAX_CLOSED = 1000
 """Closed episodes that are kept; older ones are in the recording."""
@@ -149,7 +146,7 @@ class EpisodeLog:
         before, again = self._entries, False
         while True:
             log, passage = self._cursor.log, self._engine.notices.passage
-            pull = self._engine.pull(self._cursor, PULLED_ROWS)
+            pull = self._engine.pull(self._cursor, MAX_PULL_ROWS)
             if not pull.fresh and pull.first < self.tracker.first:
                 # A late measurement belongs before the rows that are kept: pull all of them again.
                 self._cursor.revision = -1
@@ -162,7 +159,7 @@ class EpisodeLog:
                 self._earlier = self._earlier if again or log < 0 else ()
                 self.tracker = self._new_tracker(pull)
             self.tracker.feed(pull.events, pull.track, pull.first)
-            if len(pull.events) < PULLED_ROWS:
+            if len(pull.events) < MAX_PULL_ROWS:
                 break
         tracker = self.tracker
         if tracker.n:

@@ -13,11 +13,8 @@ from estimators.snapshots import Base
 from estimators.track import Track
 from estimators.tuning import Tuning
 
-from .copies import Cursor, Pull
+from .copies import MAX_PULL_ROWS, Cursor, Pull
 from .running_fold import Running
-
-COPY_EVENTS = 4096
-"""Events that are copied at once."""
 
 
 def copy_log(
@@ -37,9 +34,9 @@ def copy_log(
     end = engine.end()
     at, base = engine.origin(0 if most is None else max(0, end - most))
     pieces = []
-    for start in range(at, end, COPY_EVENTS):
+    for start in range(at, end, MAX_PULL_ROWS):
         check()
-        pull = engine.rows(start, min(start + COPY_EVENTS, end))
+        pull = engine.rows(start, min(start + MAX_PULL_ROWS, end))
         if pull.settings is None or pull.settings[0] is not tuning or pull.first != start:
             raise ConfigError("the history changed while it was copied; try again")
         pieces.append(pull.events)
@@ -50,15 +47,11 @@ def copy_log(
     return log, base
 
 
-COPY_ROWS = 16_384
-"""Rows copied at once."""
-
-
 def copy_rows(engine: Running) -> Pull | None:
     """Copy all rows; None while there are none."""
     cursor = engine.cursor()
     try:
-        found = pull_rest(engine, cursor, engine.pull(cursor, COPY_ROWS), COPY_ROWS)
+        found = pull_rest(engine, cursor, engine.pull(cursor, MAX_PULL_ROWS), MAX_PULL_ROWS)
     finally:
         engine.release(cursor)
     return found if len(found.events) else None

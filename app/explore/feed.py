@@ -20,18 +20,15 @@ import numpy as np
 import rerun as rr
 
 from ..charts.colors import EITHER, Palette
+from ..engine.copies import MAX_PULL_ROWS, Pull
 from ..engine.history_copy import pull_rest
 from ..engine.notices import MAX_LINES
 from .rows import RerunRows
 from .sink import free_closed_streams
 
 if TYPE_CHECKING:
-    from ..engine.copies import Pull
     from ..engine.notices import Notice
     from ..engine.running_fold import Running
-
-MAX_PULL_ROWS = 20_000
-"""Rows pulled at once, so that a long history does not hold the engine's lock for long."""
 
 HISTORY_STRETCHES = 3000  # Stretches into which a whole history is cut for drawing
 
@@ -119,7 +116,7 @@ class RerunFeed:
         t = pull.events.t
         first = int(FIRST_WINDOWS * rows.sink.window * 1e9)
         cut = int(np.searchsorted(t, t[-1] - first)) if t.size and pull.revision else 0
-        before = self._engine.previous() if pull.revision and t.size else None
+        before = self._engine.revisions.previous() if pull.revision and t.size else None
         # A recording's timeline must not begin before its rows, of which the oldest may have been dropped.
         grey = before.events.t if before is not None else t[:0]
         known = int(np.searchsorted(grey, t[0])) if t.size else 0

@@ -20,7 +20,7 @@ from estimators.diagnostics.health import MAX_ROWS_PER_READING
 from estimators.errors import NisusError, SourceError
 from sources.worker_process import gist
 
-from ..engine.copies import Cursor, Pull
+from ..engine.copies import MAX_PULL_ROWS, Cursor, Pull
 from ..engine.jobs import LoopThread
 from ..engine.notices import Notice
 from ..format_time import counted
@@ -42,9 +42,6 @@ CHARTS_PERIOD_S = 5.0
 """Seconds between two writes of the charts. Each of their many entities costs the same for one row as for thousands."""
 
 EDIT_REST_S = 5.0  # Seconds without an edit after which the file gets a new base
-
-MAX_PULL_ROWS = 20_000
-"""Rows pulled at once, so that a long history does not hold the engine's lock for long."""
 
 ALL_STRETCHES = math.inf
 """`series` of `RerunRows`: charts as fine as on the page, however long the recording is."""

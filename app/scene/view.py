@@ -12,6 +12,7 @@ from urllib.parse import parse_qs
 from estimators.diagnostics.references import shown_track
 
 from ..charts.colors import THEMES
+from ..engine.copies import MAX_PULL_ROWS
 from ..engine.jobs import LoopThread
 from ..engine.running_fold import Running
 from .guarded_server import addresses, guarded_server, unprinted, when_connected
@@ -26,9 +27,6 @@ EDIT_REST_S = 0.4
 """Seconds without an edit before the page's scene follows: the browser draws it on one thread with the charts."""
 
 MAX_EDIT_WAIT_S = 1.0  # Seconds between two frames of that scene while a slider is dragged
-
-MAX_PULL_ROWS = 16_384
-"""Rows pulled at once, so that a long history does not hold the engine's lock for long."""
 
 
 class ViserView:

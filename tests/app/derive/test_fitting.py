@@ -21,7 +21,7 @@ from app.derive.sweep import (
     value_of,
     values_around,
 )
-from app.engine.history_copy import COPY_EVENTS
+from app.engine import history_copy
 from app.engine.jobs import CANCELLED, DONE, FAILED, Job, JobCancelled
 from estimators.errors import ConfigError
 from estimators.fit.fit import fit
@@ -55,9 +55,9 @@ def alone(n):
     return fit("kf", FIRST, [Recording(log)], wanted=WANTED)
 
 
-def test_a_fit_beside_the_twin_is_the_fit_of_its_log():
-    # More than one chunk is copied.
-    n = COPY_EVENTS + 900
+def test_a_fit_beside_the_twin_is_the_fit_of_its_log(monkeypatch):
+    monkeypatch.setattr(history_copy, "MAX_PULL_ROWS", 4096)
+    n = 5000  # more than one chunk is copied
     engine = Stepped(n, seed=3, step=0.05).engine
     found, expected = fitted(engine, WANTED), alone(n)
     assert (found.job.state, found.events, found.folds) == (DONE, n, expected.folds)

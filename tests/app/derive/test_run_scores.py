@@ -5,7 +5,7 @@ import pytest
 
 from app.derive.run_scores import RunScores
 from app.engine import commands
-from app.engine.history_copy import COPY_ROWS
+from app.engine.copies import MAX_PULL_ROWS
 from estimators.fold import fold
 from estimators.track import HELD_OUT, USED
 from estimators.tuning import Tuning
@@ -87,7 +87,7 @@ def test_scores_of_runs_that_are_forgotten_go_though_nobody_asks(monkeypatch):
 
 
 def test_a_history_of_several_pieces_is_scored_whole():
-    n = 2 * COPY_ROWS + 100
+    n = 2 * MAX_PULL_ROWS + 100
     twin = Stepped(n)
     ((_, known),) = RunScores(twin.engine).all()
     assert known.rows == n and known.score.readings == n
