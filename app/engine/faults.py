@@ -18,6 +18,9 @@ from . import commands
 FAULT_FIELDS = {"end": "duration", "sensor": "target", "input": "target", "parameter": "target"}
 """Fields of a fault with another name in the command."""
 
+SAME_FIELDS = ("row", "other", "size", "rate", "every", "count")
+"""Fields of a fault with the same name in the command."""
+
 
 @runtime_checkable
 class Faulty(Protocol):
@@ -39,16 +42,7 @@ def fault_of(command: commands.InjectFault, model: StateSpaceModel) -> Fault:
     lasts = inf if command.duration is None else command.duration
     if not (0.0 < lasts <= LARGEST or lasts == inf):
         raise ConfigError(f"InjectFault: duration is {lasts:g} s; it must be positive, and {LARGEST:g} s at most")
-    fault = Fault(
-        command.kind,
-        row=command.row,
-        other=command.other,
-        end=lasts,
-        size=command.size,
-        rate=command.rate,
-        every=command.every,
-        count=command.count,
-    )
+    fault = Fault(command.kind, end=lasts, **{name: getattr(command, name) for name in SAME_FIELDS})
     if command.target is not None:
         what, name = _target(command.kind, command.target, model)
         fault = replace(fault, **{what: name})  # type: ignore[arg-type]

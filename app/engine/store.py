@@ -537,16 +537,8 @@ class StoreWriter:
             changed["numbers"] = "{}"
         if not (changed or commands or len(tail.events) or tail.fresh or closed):
             return
-        state = {
-            "oldest": tail.oldest,
-            "end": tail.end,
-            "floor": tail.floor,
-            "taken": tail.taken,
-            "intake": tail.intake,
-            "source": source_text(twin),
-            "written": time.time(),
-            "closed": closed,
-        }
+        state = {name: getattr(tail, name) for name in ("oldest", "end", "floor", "taken", "intake")}
+        state |= {"source": source_text(twin), "written": time.time(), "closed": closed}
         self._store.write(tail, changed | {"state": json.dumps(state, default=_plain)}, commands)
         self._written = {name: of for name, (of, _) in now.items()} | {"numbers": None}
         self._mark = tail.mark

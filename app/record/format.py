@@ -91,15 +91,16 @@ class RecordingFile:
 
     def base(self, base: Base | None, index: int, revision: int) -> None:
         """Write the start of a revision's fold from event `index` on; None is the prior."""
-        self._write_json("base", base_to_json(base), index, revision)
+        self._send("base", TIMELINE, [index], json=[base_to_json(base)], revision=[revision])
 
     def tuning(self, tuning: Tuning, estimator: str, index: int, revision: int) -> None:
         """Write the tuning that applies from event `index` on."""
-        self._write_json("tuning", tuning_to_json(tuning, estimator), index, revision)
+        self._send("tuning", TIMELINE, [index], json=[tuning_to_json(tuning, estimator)], revision=[revision])
 
-    def _write_json(self, name: str, text: str, index: int, revision: int) -> None:
-        columns = rr.AnyValues.columns(json=[text], revision=[revision])
-        self.stream.send_columns(f"/nisus/{name}", indexes=[rr.TimeColumn(TIMELINE, sequence=[index])], columns=columns)
+    def _send(self, name: str, timeline: str, index: Any, **columns: Any) -> None:
+        """Write rows of an entity under /nisus with these columns, at these indices of a timeline."""
+        indexes = [rr.TimeColumn(timeline, sequence=index)]
+        self.stream.send_columns(f"/nisus/{name}", indexes=indexes, columns=rr.AnyValues.columns(**columns))
 
     def summary(self, found: Mapping[str, Any]) -> None:
         """Write the scores of the session, for lists."""
@@ -113,33 +114,30 @@ class RecordingFile:
         rows = [note for note in notes if note != before.get(note.number)]
         rows += [replace(note, text="") for number, note in before.items() if number not in numbers]
         if rows:
-            self.stream.send_columns(
-                "/nisus/annotations",
-                indexes=[rr.TimeColumn("change", sequence=np.arange(self._changes, self._changes + len(rows)))],
-                columns=rr.AnyValues.columns(
-                    number=np.array([note.number for note in rows], np.int64),
-                    t=np.array([note.t for note in rows], np.int64),
-                    text=[note.text for note in rows],
-                ),
+            self._send(
+                "annotations",
+                "change",
+                np.arange(self._changes, self._changes + len(rows)),
+                number=np.array([note.number for note in rows], np.int64),
+                t=np.array([note.t for note in rows], np.int64),
+                text=[note.text for note in rows],
             )
         self._annotations, self._changes = notes, self._changes + len(rows)
 
     def write(self, pull: Pull) -> None:
         """Write events and notices."""
         if pull.notices:
-            self.stream.send_columns(
-                "/nisus/notices",
-                indexes=[rr.TimeColumn("notice", sequence=[line.number for line in pull.notices])],
-                columns=rr.AnyValues.columns(
-                    t=np.array([line.t for line in pull.notices], np.int64),
-                    level=[line.level for line in pull.notices],
-                    text=[line.text for line in pull.notices],
-                ),
+            self._send(
+                "notices",
+                "notice",
+                [line.number for line in pull.notices],
+                t=np.array([line.t for line in pull.notices], np.int64),
+                level=[line.level for line in pull.notices],
+                text=[line.text for line in pull.notices],
             )
         count = len(pull.events)
         if not count:
             return
-        index = [rr.TimeColumn(TIMELINE, sequence=np.arange(pull.first, pull.first + count))]
         # As Arrow arrays: Rerun would turn NumPy arrays into Python lists, which is fifty times slower.
         flat: dict[str, pa.Array] = {}
         for name, column in zip(pull.events._fields, pull.events, strict=True):
@@ -147,7 +145,7 @@ class RecordingFile:
                 flat[name] = pa.array(column)
             else:
                 flat |= {f"{name}_{k}": pa.array(column[:, k]) for k in range(column.shape[1])}
-        self.stream.send_columns("/nisus/events", indexes=index, columns=rr.AnyValues.columns(**flat))
+        self._send("events", TIMELINE, np.arange(pull.first, pull.first + count), **flat)
         self.rows += count
 
     def flush(self) -> None:
@@ -214,16 +212,9 @@ def summary(
     `error` is {name, rmse, unit, coverage, against} of the first state with a truth, or else of a held-out sensor.
     """
     found = score(track, events, tuning.model, pictures, gate=tuning.gate, baseline=tuning.baseline)
-    known = {
-        "estimator": estimator,
-        "nis": found.nis,
-        "nis_low": found.nis_low,
-        "nis_high": found.nis_high,
-        "nis_dof": found.nis_dof,
-        "nis_words": found.nis_verdict.words,
-        "error": _error(found, tuning.model),
-    }
-    return dict(plain(known))
+    nis = {name: getattr(found, name) for name in ("nis", "nis_low", "nis_high", "nis_dof")}
+    nis["nis_words"] = found.nis_verdict.words
+    return dict(plain({"estimator": estimator} | nis | {"error": _error(found, tuning.model)}))
 
 
 def _error(found: Score, model: StateSpaceModel) -> dict[str, Any] | None:

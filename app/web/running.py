@@ -174,11 +174,7 @@ class RunningTwin:
 
     def discard(self) -> None:
         """Discard a twin that was never started."""
-        self.engine.stop()
-        if self.store is not None:
-            self.store.stop()
-        if self.view is not None:
-            self.view.stop()
+        _stop(self.engine, self.store, self.view)
 
     def start(self) -> None:
         """Start everything."""
@@ -214,12 +210,12 @@ class RunningTwin:
                 complain(line.text)
 
     def _close_log(self) -> None:
-        if self.publisher is not None:
-            self.publisher.stop()
-        self.engine.stop()
-        if self.store is not None:
-            self.store.stop()
-        if self.archive is not None:
-            self.archive.stop()
-        self.recorder.stop()
+        _stop(self.publisher, self.engine, self.store, self.archive, self.recorder)
         self._print_notices()
+
+
+def _stop(*parts: Any) -> None:
+    """Stop the parts of a twin that there are, in this order."""
+    for part in parts:
+        if part is not None:
+            part.stop()
