@@ -93,7 +93,7 @@ class Series:
             smoothed = self._smoother.latest
             return None if smoothed is None else KeptRows(smoothed)
         if name == PREVIOUS:
-            previous = engine.previous()
+            previous = engine.revisions.previous()
             return None if previous is None else KeptRows(previous)
         run = next((run for run in engine.revisions.runs if run.pinned and str(run.number) == name), None)
         if run is None or run is engine.revisions.runs[-1]:

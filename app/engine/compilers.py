@@ -38,7 +38,7 @@ class Compiler:
         self._process = WorkerProcess()
         self._process.ask(_set_up, niceness)
         self._work, self._left = work, 1
-        self.connection, self.pid = self._process.answers, self._process.pid
+        self.connection = self._process.answers
         self.begun = 0.0
         self.ended = False
         """Whether the process was found to have ended."""
@@ -60,11 +60,6 @@ class Compiler:
             self.stop()
             self.ended = True
         return not self._left or self.ended
-
-    @property
-    def alive(self) -> bool:
-        """Whether the process runs."""
-        return self._process.alive
 
     def end(self) -> None:
         """Have the process end; a cache entry is written completely or not at all."""

@@ -116,6 +116,7 @@ class Engine(Running):
         if self.twin.forced_baseline:
             self.notices.say(f"the baseline was accepted with --force: {self.twin.forced_baseline}", level="warn")
         self.outcomes = Outcomes()
+        """What became of messages that were sent to it."""
         self._feeder = Feeder(
             lambda: open_source(self.notices.report),
             self._inbox,
@@ -180,13 +181,9 @@ class Engine(Running):
 
     def start(self) -> None:
         """Begin to read and fold."""
-        self._watchdog.start()
-        self._refold_watchdog.start()
-        self._refolds.start()
-        self._thread.start()
-        self._feeder.start()
-        self._watchers.start()
-        self.jobs.start()
+        watchdogs = self._watchdog, self._refold_watchdog
+        for part in (*watchdogs, self._refolds, self._thread, self._feeder, self._watchers, self.jobs):
+            part.start()
         if self._awaited is not None:
             self._inbox.put(partial(self._compiled, self._awaited))
 
@@ -194,7 +191,7 @@ class Engine(Running):
         """Stop reading and folding."""
         self._stopping.set()
         run_all(self._join, self._feeder.stop, self._workshop.stop, self._refolds.stop, self.jobs.stop)
-        self._watchers.stop()
+        self._watchers.episode_log.stop()
         self._watchdog.stop()
         self._refold_watchdog.stop()
 

@@ -189,7 +189,7 @@ class Revisions:
         self._become([*kept, replace(running, number=number)])
 
     def previous(self) -> Pull | None:
-        """Return all rows of the newest previous revision; its arrays never change."""
+        """Return all rows of the newest previous revision (before a drag that goes on); its arrays never change."""
         runs = self.runs
         return runs[-2].track if len(runs) > 1 else None
 

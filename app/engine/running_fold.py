@@ -30,7 +30,6 @@ from .counts import RowCounts
 from .feeder import Feeder
 from .jobs import Jobs
 from .notices import Annotation, Annotations, Audit, AuditEntry, Notices
-from .outcomes import Outcomes
 from .revisions import Revision, Revisions
 from .watchdog import Watchdog
 
@@ -50,7 +49,6 @@ class Records(Protocol):
     """Recorder of a running twin."""
 
     finished: list[Path]
-    failure: str
     folder: Path
     """Folder of recordings that are given by name."""
 
@@ -116,9 +114,6 @@ class Running(ABC):
     """Time in which no alerts are sent, None if it was never asked for."""
     grown: frozenset[Callable[[], object]] = frozenset()
     """Called on the engine's thread after each batch; they must return at once."""
-    store: Keeper | None
-    outcomes: Outcomes
-    """What became of messages that were sent to it."""
     _feeder: Feeder
 
     def __init__(
@@ -138,7 +133,8 @@ class Running(ABC):
         self.model = twin.model
         self.pairs = twin.pairs
         self.policy = twin.policy
-        self._history = max(2 * PERMANENT_SPACING, twin.config.history)
+        self.history = max(2 * PERMANENT_SPACING, twin.config.history)
+        """Events that the log keeps at least."""
         self.estimator, self.tuning = twin.estimator, twin.tuning
         self._lock = FairLock()
         self._watchdog, self._ready = watchdog, ready
@@ -263,11 +259,8 @@ class Running(ABC):
     def _copy(self, start: int, stop: int, *, fresh: bool = False, **fields: Any) -> Pull:
         log, fold, rows = self._log, self._fold, slice(start - self._log.first, stop - self._log.first)
         events, track = log.events.select(rows).copy(), fold.track.select(rows).copy()
-        settings = fold.tuning, fold.estimator.name
-        pull = Pull(
-            self._revision, fresh, start, events, track, oldest=log.first, version=log.version, settings=settings
-        )
-        return replace(pull, **fields)
+        fields |= {"oldest": log.first, "version": log.version, "settings": (fold.tuning, fold.estimator.name)}
+        return Pull(self._revision, fresh, start, events, track, **fields)
 
     def index_at(self, t: int) -> int:
         """Return the absolute index of the first folded event at or after a time, ns; else that after the last."""
@@ -279,11 +272,6 @@ class Running(ABC):
         with self._reading():
             return self._log.first + self._fold.n
 
-    @property
-    def history(self) -> int:
-        """Events that the log keeps at least."""
-        return self._history
-
     def settled(self) -> int:
         """Return the absolute index after the last folded event that no late measurement can change any more.
 
@@ -292,7 +280,7 @@ class Running(ABC):
         with self._reading():
             log, n = self._log, self._fold.n
             oldest = log.newest - round(self.twin.config.time.horizon * 1e9)
-            return log.first + max(int(np.searchsorted(log.t[:n], oldest)), n - self._history // 2)
+            return log.first + max(int(np.searchsorted(log.t[:n], oldest)), n - self.history // 2)
 
     def span(self) -> tuple[int, int]:
         """Return the times of the first and the last event, ns; zeros while there is none. Never waits."""
@@ -316,10 +304,6 @@ class Running(ABC):
         """Return tuning and estimator of the fold that `pull` shows."""
         with self._reading():
             return self._fold.tuning, self._fold.estimator.name
-
-    def previous(self) -> Pull | None:
-        """Return all rows of the previous revision (before a drag that goes on); its arrays never change."""
-        return self.revisions.previous()
 
     def belief(self, t: int | None = None) -> Belief:
         """Return the estimate after the last event at or before a time, ns; None is the present one.
@@ -434,7 +418,7 @@ class Running(ABC):
 
     def _clear(self, base: Base | None) -> None:
         """Begin an empty log and the fold that follows it."""
-        self._log = Log.resume(self.model, base, capacity=self._history + 4 * PERMANENT_SPACING)
+        self._log = Log.resume(self.model, base, capacity=self.history + 4 * PERMANENT_SPACING)
         self._logs += 1
         self._base = base
         idle = not self._ready(self.estimator)
@@ -495,9 +479,9 @@ class Running(ABC):
 
     def _forget(self) -> None:
         """Once there are many events, drop the oldest up to a snapshot, from which later refolds start."""
-        if self._fold.idle or self._log.n <= self._history + 3 * PERMANENT_SPACING:
+        if self._fold.idle or self._log.n <= self.history + 3 * PERMANENT_SPACING:
             return
-        count = (self._log.n - self._history) // PERMANENT_SPACING * PERMANENT_SPACING
+        count = (self._log.n - self.history) // PERMANENT_SPACING * PERMANENT_SPACING
         count, self._base = self._fold.base_at(count)
         if count:
             self._row_counts.forget(self._fold.track.select(slice(0, count)), self._log.channel[:count])

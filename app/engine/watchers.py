@@ -54,10 +54,6 @@ class Watchers:
         self._jobs.run("root cause", self.root_cause.update, every=ROOT_CAUSE_PERIOD_S)
         self._jobs.run("repeated values", self.repeats.look, every=REPEATS_PERIOD_S)
 
-    def stop(self) -> None:
-        """Look at the last rows and end."""
-        self.episode_log.stop()
-
     def arrived(self, batch: Events, passed: Events) -> None:
         """Note a batch of a live source that was folded, and those of its events that passed."""
         self.latency.note(batch)

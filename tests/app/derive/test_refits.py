@@ -11,7 +11,6 @@ from app.cli.main import main
 from app.cli.open_twin import live_source, recorded_twin
 from app.derive.refits import ADOPTED, BROKEN, DISMISSED, FITTING, NOTHING, OFFERED, OUTDATED, Refits
 from app.engine.commands import Record, SetTuning
-from app.engine.feeder import Delivery
 from app.record.reader import read_recording
 from app.twin.twin import load_twin
 from app.web.running import OpenedTwin
@@ -201,8 +200,7 @@ def test_events_are_folded_while_a_fit_is_under_way(begin):
     twin.refits.look()
     engine = twin.engine
     # Rows come, and the fit that is due meanwhile waits.
-    engine._inbox.put(Delivery(readings([WINDOW + 2.0], [40.0]), 0))
-    engine._round(0.0)
+    engine._accept([readings([WINDOW + 2.0], [40.0])])
     assert row_count(engine) == (WINDOW + 1) * RATE + 1
     twin.refits.look()
     assert [item.state for item in twin.refits.known] == [FITTING]

@@ -118,7 +118,7 @@ def test_readings_are_folded_while_another_filter_is_compiled_and_the_swap_loses
     status = fresh_status(engine)
     assert (engine.folded_with()[1], status.awaited, status.compiling) == ("ukf", None, {})
     assert_same(pull_all(engine).track, cold(times, values, "ukf"))
-    assert_same(engine.previous().track, cold(times[:200], values[:200], "kf"))
+    assert_same(engine.revisions.previous().track, cold(times[:200], values[:200], "kf"))
 
 
 def test_before_the_first_filter_is_compiled_the_log_grows_and_nothing_is_estimated(started, tmp_path):
@@ -312,11 +312,11 @@ def test_workers_that_began_before_the_workshop_compile_in_it(tmp_path):
     busy.ask("ukf")
     busy.start()
     wait_for(lambda: begun(tmp_path, piece))
-    assert begun(tmp_path, piece)[0] == worker.pid
+    assert begun(tmp_path, piece)[0] == worker._process.pid
     busy.stop()
     idle = Workshop(["ukf"], pieces=lambda _: [], workers=[other])
     idle.start()
-    assert not worker.alive and not other.alive
+    assert not worker._process.alive and not other._process.alive
 
 
 def test_workers_begin_before_all_else_only_where_nothing_was_compiled(tmp_path, monkeypatch):

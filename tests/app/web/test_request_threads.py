@@ -17,24 +17,21 @@ def started_by(act):
 
 def test_all_threads_start_with_the_first_request_and_none_with_more():
     threads, go_on = RequestThreads("test", 4), threading.Event()
-    try:
-        first, started = started_by(lambda: threads.submit(lambda: 7))
-        assert first.result(LIMIT_S) == 7 and len(started) == 4
-        busy = threading.Barrier(5)
+    first, started = started_by(lambda: threads.submit(lambda: 7))
+    assert first.result(LIMIT_S) == 7 and len(started) == 4
+    busy = threading.Barrier(5)
 
-        def wait():
-            busy.wait(LIMIT_S)
-            go_on.wait(LIMIT_S)
-            return threading.current_thread()
+    def wait():
+        busy.wait(LIMIT_S)
+        go_on.wait(LIMIT_S)
+        return threading.current_thread()
 
-        outcomes, more = started_by(lambda: [threads.submit(wait) for _ in range(4)])
-        busy.wait(LIMIT_S)  # all four are at work
-        queued, further = started_by(lambda: [threads.submit(threading.current_thread) for _ in range(20)])
-        assert not more and not further and not any(item.done() for item in queued)
-        go_on.set()
-        assert {item.result(LIMIT_S) for item in outcomes + queued} == started
-    finally:
-        go_on.set()
+    outcomes, more = started_by(lambda: [threads.submit(wait) for _ in range(4)])
+    busy.wait(LIMIT_S)  # all four are at work
+    queued, further = started_by(lambda: [threads.submit(threading.current_thread) for _ in range(20)])
+    assert not more and not further and not any(item.done() for item in queued)
+    go_on.set()
+    assert {item.result(LIMIT_S) for item in outcomes + queued} == started
 
 
 def test_an_error_is_the_request_s_and_the_thread_goes_on():
