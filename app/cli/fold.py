@@ -10,36 +10,20 @@ from typing import TYPE_CHECKING
 
 from config.extensions import left_out, maker, registered
 from config.yaml_files import writing
-from estimators.diagnostics.episodes import episodes
-from estimators.diagnostics.score import score
 from estimators.errors import ConfigError
 from estimators.registry import find_estimator
 
 from ..record.rrd_file import TAKEN
 from ..render.text import to_text
 from ..result import to_json
-from ..study.fold_result import (
-    FoldResult,
-    calibration_of,
-    coverage_of,
-    dropped,
-    explained,
-    fold_json,
-    fold_topics,
-    known_states,
-    nees_of,
-    pairs_with,
-    rows_of,
-    smoothing_score,
-    with_covariance,
-    within,
-)
+from ..study.fold_result import FoldResult, fold_json, fold_topics, known_states, pairs_with, rows_of, with_covariance
 from ..study.scores import pictures_of
 from ..twin.log_reader import read_log
 from .options import span_of
 from .prepare import attend, fold_log, opened, prepare
 
 if TYPE_CHECKING:
+    from estimators.diagnostics.episodes import Episode
     from estimators.smoothing.walk import Smoothed
 
     from .arguments import FoldCommand as Arguments
@@ -74,48 +58,33 @@ def fold_twin(arguments: Arguments) -> int:
     fold = fold_log(twin, log, picture=twin.picture if recorded else None, pairs=pairs_with(twin, kept or known))
     seconds = (time.perf_counter() - begun) / log.n
     part = rows_of(log, span_of(arguments, log.events))
-    events, track = log.events.select(part), fold.track.select(part)
-    pictures = pictures_of(fold, part)
     smoothed: Smoothed | None = attend(twin.model, lambda: smooth(fold), "smoothing") if arguments.smooth else None
-    result = FoldResult(
-        twin,
-        fold,
-        counts,
-        seconds,
-        score(track, events, twin.model, pictures, gate=twin.tuning.gate, baseline=twin.tuning.baseline),
-        calibration_of(fold, events, track),
-        explained(fold, [*dropped(counts, fold), *within(episodes(fold), events)]),
-        part,
-        smoothing_score(fold, smoothed, part) if smoothed is not None else None,
-        nees_of(fold, known, part),
-        coverage_of(fold, part),
-    )
+    result = FoldResult(twin, fold, counts, seconds, part, known, smoothed)
+    events, track, found = result.events, result.track, [item.episode for item in result.episodes]
     if out is not None:
-        _write(out, result, smoothed, write)
+        _write(out, result, found, write)
     if arguments.html is not None:
         from ..render.html import to_html
         from ..render.report import Reported, report
 
         run = Reported(
-            twin, twin.estimator, twin.tuning, events, track, pictures,
-            [item.episode for item in result.episodes], fold.marginal,
+            twin, twin.estimator, twin.tuning, events, track, pictures_of(fold, part), found, fold.marginal,
             smoothed=smoothed and smoothed.select(part),
         )  # fmt: skip
         with writing(arguments.html, "--html"):
             arguments.html.write_text(to_html(f"{twin.name}, {twin.estimator}", report(run)), encoding="utf-8")
     if arguments.plot is not None:
         with writing(arguments.plot, "--plot"):
-            found, title = [item.episode for item in result.episodes], f"{twin.name}, {twin.estimator}"
+            title = f"{twin.name}, {twin.estimator}"
             figure = plot_track(twin.model, events, track, episodes=found, title=title)
             figure.savefig(arguments.plot, dpi=150)
     print(to_json(fold_json(result)) if arguments.json else to_text(fold_topics(result)))
     return 0
 
 
-def _write(path: Path, result: FoldResult, smoothed: Smoothed | None, write: Callable[..., None] | None) -> None:
-    """Write the track as a recording, a table, or as an extension does."""
-    twin, fold = result.twin, result.fold
-    found = [item.episode for item in result.episodes]
+def _write(path: Path, result: FoldResult, found: list[Episode], write: Callable[..., None] | None) -> None:
+    """Write the track with the episodes `found` as a recording, a table, or as an extension does."""
+    twin, fold, smoothed = result.twin, result.fold, result.smoothed
     if path.suffix == ".rrd":
         from ..record.writer import write_recording
 

@@ -6,6 +6,7 @@ from collections import Counter
 from collections.abc import Iterable, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass
+from functools import cached_property
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -22,7 +23,7 @@ from estimators.diagnostics.calibration import (
 )
 from estimators.diagnostics.considered_shares import known_stds, source_texts, variance_shares
 from estimators.diagnostics.consistency import nees
-from estimators.diagnostics.episodes import Episode, episode_json
+from estimators.diagnostics.episodes import Episode, episode_json, episodes
 from estimators.diagnostics.failure_cause import failures
 from estimators.diagnostics.references import WITHHELD, own_grades, state_grades, state_health, withheld
 from estimators.diagnostics.score import Fit, Score, health_of, score
@@ -47,6 +48,7 @@ from ..result import Figure, Topic, plain
 from ..twin.ingest import dropped_episode
 from ..twin.twin import Twin
 from .calibration_lines import COVERAGE_HEAD, calibration_lines, coverage_rows, health_shares
+from .scores import pictures_of
 
 MAX_DECISIONS = 10  # latest decisions on rejected sensors that are printed; JSON has all
 MAX_EPISODES = 10  # first episodes that are printed; JSON has all
@@ -97,29 +99,59 @@ class TruthNees(NamedTuple):
 
 @dataclass(frozen=True)
 class FoldResult:
-    """A finished fold with everything measured on it; `seconds` is the time per event, `part` the scored rows."""
+    """A finished fold, and what is measured on it, each once when first needed.
+
+    `seconds` is the time per event, `part` the scored rows, `known` the states whose NEES is computed.
+    """
 
     twin: Twin
     fold: Fold
     counts: Counter[str]
     seconds: float
-    score: Score
-    calibration: list[Calibration]
-    episodes: list[ExplainedEpisode]
     part: slice
-    smoothing: SmoothingScore | None = None
-    nees: TruthNees | None = None
-    coverage: Sequence[CoverageBin] = ()
+    known: Sequence[int] = ()
+    smoothed: Smoothed | None = None
 
-    @property
+    @cached_property
     def events(self) -> Events:
         """The scored events."""
         return self.fold.log.events.select(self.part)
 
-    @property
+    @cached_property
     def track(self) -> Track:
         """Their rows."""
         return self.fold.track.select(self.part)
+
+    @cached_property
+    def scored(self) -> Score:
+        """Their scores."""
+        pictures, tuning = pictures_of(self.fold, self.part), self.twin.tuning
+        return score(self.track, self.events, self.twin.model, pictures, gate=tuning.gate, baseline=tuning.baseline)
+
+    @cached_property
+    def episodes(self) -> list[ExplainedEpisode]:
+        """Episodes that overlap their time, with suspects."""
+        lost = dropped(self.counts, self.fold)
+        return explained(self.fold, [*lost, *within(episodes(self.fold), self.events)])
+
+    @cached_property
+    def smoothing(self) -> SmoothingScore | None:
+        """Scores of the smoothed states; None if they were not requested."""
+        if self.smoothed is None:
+            return None
+        own, model = self.smoothed.select(self.part), self.fold.model
+        fits = score(own.instead_of(self.track), self.events, model, gate=self.fold.tuning.gate).states
+        return SmoothingScore(fits, consistency(self.track, own, model))
+
+    @cached_property
+    def truth_nees(self) -> TruthNees | None:
+        """NEES over the `known` states, whose covariances the fold kept; None without one."""
+        if not any(truth_of(self.events, j)[0].size for j in self.known):
+            return None
+        found = nees(self.fold.model, self.events, self.track, self.fold.pairs, self.known)
+        times = int(np.isfinite(found.value).sum())
+        names = tuple(self.fold.model.state_names[j] for j in self.known)
+        return TruthNees(found.mean, *found.mean_bounds, found.inside, names, times) if times else None
 
 
 def rows_of(log: Log, span: tuple[int, int] | None) -> slice:
@@ -127,10 +159,10 @@ def rows_of(log: Log, span: tuple[int, int] | None) -> slice:
     return slice(*(map(int, np.searchsorted(log.t[: log.n], span)) if span else (0, log.n)))
 
 
-def within(episodes: Sequence[Episode], events: Events) -> list[Episode]:
+def within(found: Sequence[Episode], events: Events) -> list[Episode]:
     """Return the episodes that overlap the time of some events."""
     first, last = float(events.t[0]) * 1e-9, float(events.t[-1]) * 1e-9
-    return [item for item in episodes if item.start <= last and (item.end is None or item.end >= first)]
+    return [item for item in found if item.start <= last and (item.end is None or item.end >= first)]
 
 
 def known_states(twin: Twin, events: Events) -> list[int]:
@@ -156,26 +188,6 @@ def pairs_with(twin: Twin, states: Sequence[int]) -> np.ndarray:
     return np.array([*map(tuple, twin.pairs), *every], int).reshape(-1, 2)
 
 
-def nees_of(fold: Fold, states: Sequence[int], part: slice) -> TruthNees | None:
-    """Return the NEES over these states in some rows of a fold that kept their covariances; None without one."""
-    events = fold.log.events.select(part)
-    if not any(truth_of(events, j)[0].size for j in states):
-        return None
-    found = nees(fold.model, events, fold.track.select(part), fold.pairs, states)
-    known = int(np.isfinite(found.value).sum())
-    if not known:
-        return None
-    names = tuple(fold.model.state_names[j] for j in states)
-    return TruthNees(found.mean, *found.mean_bounds, found.inside, names, known)
-
-
-def smoothing_score(fold: Fold, smoothed: Smoothed, part: slice) -> SmoothingScore:
-    """Score the smoothed states in some rows of a fold."""
-    events, track, own = fold.log.events.select(part), fold.track.select(part), smoothed.select(part)
-    fits = score(own.instead_of(track), events, fold.model, gate=fold.tuning.gate).states
-    return SmoothingScore(fits, consistency(track, own, fold.model))
-
-
 def calibration_of(fold: Fold, events: Events, track: Track) -> list[Calibration]:
     """Return the calibration of every sensor row, and of every state whose truth is known, in rows of a fold."""
     rows = calibrations(fold.model, events, track, gate=fold.tuning.gate, marginal=fold.marginal)
@@ -199,11 +211,11 @@ def dropped(counts: Mapping[str, int], fold: Fold) -> list[Episode]:
     return [dropped_episode(float(fold.log.t[0]) * 1e-9, lost, lost + kept)]
 
 
-def explained(fold: Fold, episodes: Sequence[Episode]) -> list[ExplainedEpisode]:
+def explained(fold: Fold, listed: Sequence[Episode]) -> list[ExplainedEpisode]:
     """Add suspects to the first episodes with shifted measurements."""
     found: list[ExplainedEpisode] = []
     searched = 0
-    for episode in episodes:
+    for episode in listed:
         named: tuple[Suspect, ...] = ()
         words = ""
         if isolates(episode.cause) and searched < MAX_EXPLAINED:
@@ -218,7 +230,7 @@ def explained(fold: Fold, episodes: Sequence[Episode]) -> list[ExplainedEpisode]
 
 def fold_json(result: FoldResult) -> dict[str, Any]:
     """Return a fold for scripts; docs/reference.md describes its fields."""
-    twin, fold, scored, counts = result.twin, result.fold, result.score, result.counts
+    twin, fold, scored, counts = result.twin, result.fold, result.scored, result.counts
     smoothing = result.smoothing
     cov = fold.moments()[1] if fold.model.considered else None
     found = {
@@ -231,7 +243,7 @@ def fold_json(result: FoldResult) -> dict[str, Any]:
         **({"field": {"rmse": scored.field.rmse, "coverage": scored.field.coverage}} if scored.field else {}),
         **_errors(scored.states),
         **({"smoothed": {**_errors(smoothing.states), "consistency": smoothing.consistency}} if smoothing else {}),
-        "nees": result.nees,
+        "nees": result.truth_nees,
         "held_out": {
             name: {"rmse": fit.rmse, "bias": fit.bias, "coverage": fit.coverage}
             for name, fit in scored.held_out.items()
@@ -266,8 +278,8 @@ def fold_json(result: FoldResult) -> dict[str, Any]:
         "account": fold.account(),
         "health": health_of(result.events, result.track, fold.policy),
         "states": _grades(result),
-        "calibration": [calibration_json(entry) for entry in result.calibration],
-        "coverage_bins": result.coverage,
+        "calibration": [calibration_json(entry) for entry in calibration_of(fold, result.events, result.track)],
+        "coverage_bins": coverage_of(fold, result.part),
         "variance": variance_shares(fold.model, cov) if cov is not None else {},
         "known": known_stds(fold.model, cov) if cov is not None else {},
         "episodes": [_episode_json(item) for item in result.episodes],
@@ -351,19 +363,21 @@ def _failure_cause(fold: Fold) -> str | None:
 
 def fold_topics(result: FoldResult) -> list[Topic]:
     """Return a fold as topics: figures, calibration, episodes."""
-    calibration = calibration_lines(result.calibration, result.twin.model)
-    topics = [Topic(f"{result.twin.name}: {result.twin.title}", figures=tuple(_figures(result)))]
+    twin, fold = result.twin, result.fold
+    calibration = calibration_lines(calibration_of(fold, result.events, result.track), twin.model)
+    topics = [Topic(f"{twin.name}: {twin.title}", figures=tuple(_figures(result)))]
     if calibration:
         topics.append(Topic("Calibration, 95 % intervals", tuple(calibration)))
-    if rows := coverage_rows(result.coverage, result.twin.model):
-        left = sum(item.by == WHOLE for item in result.coverage) - len(rows)
+    coverage = coverage_of(fold, result.part)
+    if rows := coverage_rows(coverage, twin.model):
+        left = sum(item.by == WHOLE for item in coverage) - len(rows)
         said = (f"The {len(rows)} lowest; {left} more are in --json.",) if left else ()
         topics.append(Topic("Coverage of the 95 % bands over time", said, COVERAGE_HEAD, tuple(rows)))
     return [*topics, episodes_topic(result.episodes)]
 
 
 def _figures(result: FoldResult) -> list[Figure]:
-    twin, fold, scored, counts = result.twin, result.fold, result.score, result.counts
+    twin, fold, scored, counts = result.twin, result.fold, result.scored, result.counts
     model, events, track = twin.model, result.events, result.track
     units = units_by_name(model)
     found = [Figure("estimator", twin.estimator, remark=_options_text(fold)), Figure("tuning", twin.tuning.name)]
@@ -385,9 +399,9 @@ def _figures(result: FoldResult) -> list[Figure]:
         shown = [f"{name} {value:.2f}" for name, value in result.smoothing.consistency.items() if np.isfinite(value)]
         if shown:
             found.append(Figure("smoother against filter", ", ".join(shown), remark="1 where the model holds"))
-    if result.nees is not None:
-        title = "mean NEES" if len(result.nees.states) > 1 else f"mean NEES of {result.nees.states[0]}"
-        found.append(Figure(title, result.nees.mean, remark=result.nees.remark))
+    if result.truth_nees is not None:
+        title = "mean NEES" if len(result.truth_nees.states) > 1 else f"mean NEES of {result.truth_nees.states[0]}"
+        found.append(Figure(title, result.truth_nees.mean, remark=result.truth_nees.remark))
     if scored.nis_readings:
         verdict = scored.nis_verdict
         said = f"{verdict.said}; {counted(scored.nis_readings, 'reading')}"
@@ -461,7 +475,7 @@ def _rmse(name: str, fit: Fit, unit: str) -> Figure:
 
 def _held_out(result: FoldResult, units: Mapping[str, str]) -> list[Figure]:
     """Return the errors of held-out rows; many rows of one sensor, or those of a family, are one figure."""
-    model, fits = result.twin.model, dict(result.score.held_out)
+    model, fits = result.twin.model, dict(result.scored.held_out)
     groups: dict[str, list[str]] = {}
     for sensor, start in zip(model.sensors, model.row_start, strict=True):
         names = [name for name in model.row_names[start : start + len(sensor.rows)] if name in fits]
