@@ -88,6 +88,14 @@ class Topic(NamedTuple):
         columns = [TableColumn(column) if isinstance(column, str) else column for column in self.columns]
         return [[column.text(cell) for column, cell in zip(columns, row, strict=True)] for row in self.rows]
 
+    def cut(self, most: int, remark: str = "") -> Topic:
+        """Return the topic with at most `most` rows, and one with the number of the rest and a remark."""
+        left = len(self.rows) - most
+        if left <= 1:
+            return self
+        rows = (*self.rows[:most], (f"... and {left} more{remark}", *[""] * (len(self.columns) - 1)))
+        return self._replace(rows=rows, marks=(*self.marks[:most], "") if self.marks else ())
+
     def is_numeric(self, k: int) -> bool:
         """Return whether column k holds numbers, which are aligned to the right."""
         column = [row[k] for row in self.rows if row[k] not in (None, "", "-")]

@@ -74,16 +74,7 @@ def report(run: Reported) -> list[Topic]:
     if run.others:
         head = ("run", "change", "NIS / dof", "log L per measurement", "RMSE")
         topics.append(Topic("Runs of the session", (), head, run.others))
-    return [_cut(topic) for topic in topics]
-
-
-def _cut(topic: Topic) -> Topic:
-    """Return a topic with at most `MAX_ROWS` rows, and one with the number of the rest."""
-    left = len(topic.rows) - MAX_ROWS
-    if left <= 1:
-        return topic
-    rows = (*topic.rows[:MAX_ROWS], (f"... and {left} more", *[""] * (len(topic.rows[0]) - 1)))
-    return topic._replace(rows=rows, marks=(*topic.marks[:MAX_ROWS], "") if topic.marks else ())
+    return [topic.cut(MAX_ROWS) for topic in topics]
 
 
 def _head(run: Reported) -> Topic:

@@ -347,12 +347,10 @@ def _table(
     legend: tuple[str, str] = ("", ""),
 ) -> Topic:
     """Return a topic with at most `MAX_ROWS` rows, a note on the others, and the sentences that are not empty."""
-    shown: list[tuple[Cell, ...]] = [tuple(plain(cell) for cell in row) for row in rows]
-    if len(rows) > MAX_ROWS + 1:
-        more = f"... and {len(rows) - MAX_ROWS} more, see --json"
-        shown = [*shown[:MAX_ROWS], (more, *[""] * (len(columns) - 1))]
+    shown = tuple(tuple(plain(cell) for cell in row) for row in rows)
     said = tuple(filter(None, sentences))
-    return Topic(title, said, tuple(columns) if rows else (), tuple(shown), tuple(bars[:MAX_ROWS]), legend)
+    topic = Topic(title, said, tuple(columns) if rows else (), shown, tuple(bars[:MAX_ROWS]), legend)
+    return topic.cut(MAX_ROWS, ", see --json")
 
 
 def _fault_topics(checked: Checked) -> list[Topic]:

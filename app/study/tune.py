@@ -42,9 +42,8 @@ def window_json(recording: int, refit: WindowFit, origin: int) -> dict[str, Any]
 def window_topics(found: Sequence[tuple[int, WindowFit]], origins: Sequence[int]) -> list[Topic]:
     """Return a table per entry: value and interval in each window, and the value in use after it."""
     keys = dict.fromkeys(line.key for _, refit in found if refit.fitted is not None for line in refit.fitted.lines)
-    head = (
-        *_place(None, None, origins), "fitted", "95 % interval", "σ moved", "gain, nats a reading", "went on with",
-    )  # fmt: skip
+    place = ("recording", "from s", "to s") if len(origins) > 1 else ("from s", "to s")
+    head = (*place, "fitted", "95 % interval", "σ moved", "gain, nats a reading", "went on with")
     sections = []
     for key in keys:
         rows = []
@@ -59,12 +58,10 @@ def window_topics(found: Sequence[tuple[int, WindowFit]], origins: Sequence[int]
     return sections
 
 
-def _place(k: int | None, refit: WindowFit | None, origins: Sequence[int]) -> tuple[str, ...]:
-    """Recording, where there are several, start and end of a window, s; the head of these columns for None."""
-    if k is None or refit is None:
-        return (*(("recording",) if len(origins) > 1 else ()), "from s", "to s")
-    at = (f"{(t - origins[k]) * 1e-9:,.0f}" for t in (refit.start, refit.end))
-    return (*((str(k + 1),) if len(origins) > 1 else ()), *at)
+def _place(k: int, refit: WindowFit, origins: Sequence[int]) -> tuple[str, ...]:
+    """Recording, where there are several, start and end of a window, s."""
+    begin, end = (f"{(t - origins[k]) * 1e-9:,.0f}" for t in (refit.start, refit.end))
+    return (str(k + 1), begin, end) if len(origins) > 1 else (begin, end)
 
 
 def _window_row(refit: WindowFit, line: EntryFit | None) -> tuple[str, ...]:
