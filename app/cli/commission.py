@@ -16,10 +16,8 @@ from ..study.commission import baseline_of, lines, section_file
 from ..study.fold_result import coverage_of
 from ..terminal import complain
 from ..twin.log_reader import read_log
-from ..twin.twin import load_twin
 from ..twin.versions import write_section
-from .options import overrides_of
-from .prepare import prepare
+from .prepare import prepared
 
 if TYPE_CHECKING:
     from .arguments import CommissionCommand as Arguments
@@ -28,9 +26,7 @@ if TYPE_CHECKING:
 def commission_twin(arguments: Arguments) -> int:
     """Carry the command out."""
     # What is normal is told from white innovations, not from what was normal before.
-    overrides = {**overrides_of(arguments), "commissioned": "{}"}
-    twin = load_twin(arguments.twin, log_files=arguments.log or None, overrides=overrides)
-    prepare(twin)
+    twin = prepared(arguments, commissioned="{}")
     log, _ = read_log(twin, arguments.duration)
     fold = twin.fold(log, policy=twin.policy)
     interruptible(fold, fold.advance)

@@ -22,7 +22,7 @@ from ..web.gallery.gallery import Gallery, Opener, SavedFiles, StartRequest
 from ..web.gallery.recordings import Recordings
 from ..web.running import OpenedTwin, stamp_of
 from ..web.session import Page, Session
-from .prepare import begin_to_compile, compile_for, prepare_model
+from .prepare import begin_to_compile, compile_for
 
 if TYPE_CHECKING:
     from sources.source import Source
@@ -148,7 +148,7 @@ class FileOpener:
         workshop = begin_to_compile(opening.twin, workers)
         try:
             opening.twin.check_files()
-            prepare_model(opening.twin, workshop)
+            compile_for(opening.twin, workshop)
         except BaseException:
             workshop.stop()
             raise

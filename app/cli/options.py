@@ -158,23 +158,17 @@ def check_options(name: str, command: type, words: Sequence[str]) -> None:
     Raises:
         ConfigError: With the option, its value and the nearest option.
     """
-    hints = get_type_hints(command)
-    known = {f"--{field.replace('_', '-')}": hints[field] for field in options_of(command)}
-    repeatable = {
-        f"--{field.replace('_', '-')}"
-        for field, hint in options_of(command).items()
-        if tyro.conf.UseAppendAction in getattr(hint, "__metadata__", ())
-    }
+    known = {f"--{field.replace('_', '-')}": hint for field, hint in options_of(command).items()}
     seen: set[str] = set()
     for word, after in zip(words, [*words[1:], ""], strict=False):
         option, equals, own = word.partition("=")
         if not option.startswith("--") or option == "--help":
             continue
-        hint = known.get(option.replace("_", "-"))
+        name_of = option.replace("_", "-")
+        hint = known.get(name_of)
         if hint is None:
             raise ConfigError(f"{quoted(option)}: `nisus {name}` has no such option; {nearest(option, known)}")
-        name_of = option.replace("_", "-")
-        if name_of in seen - repeatable and get_origin(hint) is tuple:
+        if name_of in seen and get_origin(hint) is tuple:  # a repeatable option is Annotated
             raise ConfigError(f"{option}: is given twice, of which only the last would count; name all after the first")
         seen.add(name_of)
         value = own if equals else after

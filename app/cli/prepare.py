@@ -30,18 +30,18 @@ if TYPE_CHECKING:
 STATUS_DELAY_S = 1.0  # seconds before the line appears; loading from the cache takes less
 
 
-def opened(arguments: Any) -> Twin:
-    """Return the twin that a command names, with its `--log`, `--set`, `--estimator` and `--tuning`.
+def opened(arguments: Any, **others: str) -> Twin:
+    """Return the twin that a command names, with its `--log`, `--set`, `--estimator` and `--tuning`, and `others`.
 
     Raises:
         NisusError: If its YAML or its model is wrong.
     """
-    return load_twin(arguments.twin, log_files=arguments.log or None, overrides=overrides_of(arguments))
+    return load_twin(arguments.twin, log_files=arguments.log or None, overrides=overrides_of(arguments) | others)
 
 
-def prepared(arguments: Any) -> Twin:
+def prepared(arguments: Any, **others: str) -> Twin:
     """Return the twin that a command names, see `opened`, once its filter and model are compiled."""
-    twin = opened(arguments)
+    twin = opened(arguments, **others)
     prepare(twin)
     return twin
 
@@ -81,20 +81,26 @@ def prepare(twin: Twin) -> None:
     compile_for(twin)
 
 
-def compile_for(twin: Twin) -> None:
+def compile_for(twin: Twin, workshop: Workshop | None = None) -> None:
     """Compile the twin's model and estimator, and what its source needs, or load them from the cache.
+
+    With a workshop it compiles all but the model in other processes, and the twin's estimator may take longer.
 
     Raises:
         NisusError: If the model does not compile, or the estimator does not apply.
     """
 
     def work() -> None:
-        twin.fold(pairs=twin.pairs)
+        twin.fold(pairs=twin.pairs, idle=workshop is not None)
         for name in twin.kernels:
-            for piece in pieces_of(name):
-                make(piece)
+            if workshop is not None:
+                workshop.wait(name)
+            else:
+                for piece in pieces_of(name):
+                    make(piece)
 
-    attend(twin.model, work, "compiling filters, once", "compiled filters, once")
+    what = "filters" if workshop is None else "the model"
+    attend(twin.model, work, f"compiling {what}, once", f"compiled {what}, once")
 
 
 def begin_to_compile(twin: Twin, workers: Sequence[Compiler] = ()) -> Workshop:
@@ -108,21 +114,6 @@ def begin_to_compile(twin: Twin, workers: Sequence[Compiler] = ()) -> Workshop:
         workshop.ask(name)
     workshop.start()
     return workshop
-
-
-def prepare_model(twin: Twin, workshop: Workshop) -> None:
-    """Compile the twin's model alone, or load it from the cache, while the workshop compiles what its source needs.
-
-    Raises:
-        ModelError: If it does not compile.
-    """
-
-    def work() -> None:
-        twin.fold(pairs=twin.pairs, idle=True)
-        for name in twin.kernels:
-            workshop.wait(name)
-
-    attend(twin.model, work, "compiling the model, once", "compiled the model, once")
 
 
 def attend(

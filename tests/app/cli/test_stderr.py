@@ -85,7 +85,7 @@ def test_files_of_a_source_are_looked_at_before_anything_is_compiled(drive, opti
         raise AssertionError("it went on")
 
     monkeypatch.setattr(app.cli.open_twin, "begin_to_compile", lambda *_: Workshop())
-    monkeypatch.setattr(app.cli.open_twin, "prepare_model", too_late)
+    monkeypatch.setattr(app.cli.open_twin, "compile_for", too_late)
     monkeypatch.setattr(app.cli.prepare, "attend", too_late)
     (drive / "drive.csv").write_text("t,y\n0,1\n")
     (line,) = said(capsys, "run", str(drive / "drive.yaml"), "--no-browser", "--port", "0", *options)
