@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 from zoneinfo import available_timezones
@@ -29,7 +28,7 @@ from ..format_time import FIRST_DATED_NS, duration_text, format_time
 from ..render.text import to_text
 from ..result import Cell, TableColumn, Topic, to_json
 from ..study.advice.draft import undecided_lines
-from ..study.advice.signals import signals
+from ..study.advice.signals import rate_of, signals
 from ..terminal import complain
 
 if TYPE_CHECKING:
@@ -182,19 +181,12 @@ def _time_cells(t: np.ndarray, start: int) -> tuple[Cell, ...]:
     if not t.size:
         return 0, None, None, None, None
     gap = float(np.diff(t).max()) * 1e-9 if t.size > 1 else None
-    return int(t.size), _rate(t), float(t[0] - start) * 1e-9, float(t[-1] - start) * 1e-9, gap
+    return int(t.size), rate_of(t), float(t[0] - start) * 1e-9, float(t[-1] - start) * 1e-9, gap
 
 
 def _series_cells(series: SignalSeries, start: int) -> tuple[Cell, ...]:
     low, high = (float(series.values.min()), float(series.values.max())) if series.values.size else (None, None)
     return *_time_cells(series.t, start), low, high
-
-
-def _rate(t: np.ndarray) -> float:
-    """Return the sample rate from the median interval, which gaps do not change; NaN without two times."""
-    intervals = np.diff(t)
-    intervals = intervals[intervals > 0]
-    return 1e9 / float(np.median(intervals)) if intervals.size else math.nan
 
 
 def _as_dict(found: RecordingContents) -> dict[str, Any]:
@@ -231,7 +223,7 @@ def _message(message: Message) -> dict[str, Any]:
 def _span(t: np.ndarray) -> dict[str, Any]:
     return {
         "number": int(t.size),
-        "rate": _rate(t),
+        "rate": rate_of(t),
         "start_ns": t[0] if t.size else None,
         "end_ns": t[-1] if t.size else None,
         "longest_gap_ns": np.diff(t).max() if t.size > 1 else None,

@@ -21,9 +21,9 @@ from sources.tables.rows import names_of
 from sources.tables.times import TimeColumn
 
 from .advice.draft import write_draft
-from .advice.draft_fit import fit_plan
+from .advice.draft_fit import DraftStep, fit_plan
 from .advice.plan import OMITTED, SENSOR, STATE, DraftPlan, Roles, SignalRole, plan
-from .advice.signals import signal
+from .advice.signals import rate_of, signal
 
 CURVE_BUCKETS = 300
 """Buckets of a curve, each with its lowest and highest value; a shorter series keeps all its values."""
@@ -160,15 +160,6 @@ def proposed_role(one: SignalRole) -> str:
     return STATE if one.role == SENSOR and one.reason.partition("; ")[0] == f"measures {one.name}" else one.role
 
 
-@dataclass(frozen=True)
-class DraftStep:
-    """Progress of a draft: what is under way, and at the end the draft's file and its content in words."""
-
-    doing: str
-    file: str | None = None
-    summary: str = ""
-
-
 def draft(
     path: Path, databases: Sequence[Path], time: TimeColumn, name: str, roles: Mapping[str, Sequence[str]]
 ) -> Iterator[DraftStep]:
@@ -189,11 +180,7 @@ def draft(
     buses: list[tuple[Path, BusName]] = [(file, None) for file in databases]
     found = inspect_recordings([path], buses, time)
     yield DraftStep("estimating noises, time constants and gains")
-    drafted = plan(found, Roles(**{role: tuple(names) for role, names in roles.items()}))
-    for step in fit_plan(drafted):
-        if step.doing:
-            yield DraftStep(step.doing)
-        drafted = step.plan or drafted
+    drafted = yield from fit_plan(plan(found, Roles(**{role: tuple(names) for role, names in roles.items()})))
     yield DraftStep("writing the twin")
     written = write_draft(drafted, found, name, path.parent, buses)
     yield DraftStep("", str(written.yaml_path), _summary(drafted))
@@ -283,10 +270,9 @@ def _signal(group: str, one: SignalSeries) -> SignalOverview:
 
 
 def _frames(message: Message) -> FrameOverview:
-    apart = np.diff(message.t)
-    apart = apart[apart > 0]
-    rate = 1e9 / float(np.median(apart)) if apart.size else None
-    return FrameOverview("" if message.bus is None else str(message.bus), shown_id(message.key), message.t.size, rate)
+    rate = rate_of(message.t)
+    bus = "" if message.bus is None else str(message.bus)
+    return FrameOverview(bus, shown_id(message.key), message.t.size, rate if math.isfinite(rate) else None)
 
 
 def curve(t: np.ndarray, values: np.ndarray, start: int, end: int, buckets: int = CURVE_BUCKETS) -> Curve:

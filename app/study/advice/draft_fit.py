@@ -216,15 +216,16 @@ def _written(item: Moves, noise: str, structure: Structure, model: StateSpaceMod
     return replace(item, q=value(f"Q.{noise}"), sensors=tuple(sensors), over=over)
 
 
-class FitStep(NamedTuple):
-    """Progress of a fit, and at its end the plan."""
+class DraftStep(NamedTuple):
+    """Progress of a draft: what is under way, and at the end the draft's file and its content in words."""
 
     doing: str
-    plan: DraftPlan | None = None
+    file: str | None = None
+    summary: str = ""
 
 
-def fit_plan(drafted: DraftPlan, progress: FitProgress | None = None) -> Iterator[FitStep]:
-    """Yield the steps of fitting a draft and checking it; the last one has the plan with its `check`.
+def fit_plan(drafted: DraftPlan, progress: FitProgress | None = None) -> Generator[DraftStep, None, DraftPlan]:
+    """Yield the steps of fitting a draft and checking it; return the plan with its `check`.
 
     It is fitted to the first half of the recording and checked on the second. If these differ, it is fitted to every
     other eighth and checked on the others. `check` is None if the filter fails on the recording.
@@ -236,13 +237,13 @@ def fit_plan(drafted: DraftPlan, progress: FitProgress | None = None) -> Iterato
     progress = progress or FitProgress()
     found = yield from _fit_split(drafted, split_of(drafted), progress)
     if found.check is not None and HALVES_DIFFER in found.check.reason and not progress.stop:
-        yield FitStep("the halves differ: fitting every other eighth")
+        yield DraftStep("the halves differ: fitting every other eighth")
         again = yield from _fit_split(drafted, split_of(drafted, ALTERNATE_PARTS), progress)
         found = again if again.check is not None else found
-    yield FitStep("", found)
+    return found
 
 
-def _fit_split(drafted: DraftPlan, split: Split, progress: FitProgress) -> Generator[FitStep, None, DraftPlan]:
+def _fit_split(drafted: DraftPlan, split: Split, progress: FitProgress) -> Generator[DraftStep, None, DraftPlan]:
     """Yield the steps of fitting a draft to some parts of its recording; return the plan, checked on the others."""
     t = np.concatenate([reads.signal.series.t for reads in drafted.sensors])
     span = float(t.max() - t.min()) * 1e-9
@@ -252,7 +253,7 @@ def _fit_split(drafted: DraftPlan, split: Split, progress: FitProgress) -> Gener
         choices: list[list[FittedStructure | None]] = []
         early: list[int] = []  # readings in the fitted parts
         for k, item in enumerate(drafted.states):
-            yield FitStep(f"fitting {item.name}, {k + 1} of {len(drafted.states)} states")
+            yield DraftStep(f"fitting {item.name}, {k + 1} of {len(drafted.states)} states")
             inputs = [each for each in drafted.inputs if each[0] in item.inputs]
             early.append(sum(int(split.fitted(reads.signal.series.t).sum()) for reads in item.sensors))
             able = early[-1] >= MIN_VALUES and not progress.stop
@@ -260,7 +261,7 @@ def _fit_split(drafted: DraftPlan, split: Split, progress: FitProgress) -> Gener
         tried: list[DraftFold] = []
         for k, one in enumerate(_combined(drafted, choices)):
             if not tried or not progress.stop:
-                yield FitStep(f"comparing filters, number {k + 1}")
+                yield DraftStep(f"comparing filters, number {k + 1}")
                 with suppress(NisusError):  # It diverges.
                     model = files.model(one.states, one.inputs)
                     tried.append(DraftFold(one, model, split, fitted_only=True))
@@ -274,11 +275,11 @@ def _fit_split(drafted: DraftPlan, split: Split, progress: FitProgress) -> Gener
         plain = [one for one in alike if not one.drafted.options]
         best = min(plain or alike, key=lambda one: one.memory)
         fitted_plan = best.drafted
-        yield FitStep("checking on the parts left out" if split.alternate else "checking on the second half")
+        yield DraftStep("checking on the parts left out" if split.alternate else "checking on the second half")
         with suppress(NisusError):
             fitted_plan = replace(fitted_plan, check=DraftFold(fitted_plan, best.model, split).check(span))
             if fitted_plan.check is not None and min(early) < MIN_FITTED and not progress.stop:
-                yield FitStep("fitting all of the short recording")
+                yield DraftStep("fitting all of the short recording")
                 whole = Split((int(t.max()) + 1,))
                 again = [_again(item, fitted_plan, whole, span, files, progress) for item in fitted_plan.states]
                 check = fitted_plan.check._replace(refitted=True)
@@ -326,11 +327,12 @@ def fit_all(
     drafted: DraftPlan, report: Callable[[str], object] = str, progress: FitProgress | None = None
 ) -> DraftPlan:
     """Return the fitted plan; `report` is called with each step of `fit_plan`."""
-    for step in fit_plan(drafted, progress):
-        if step.doing:
-            report(step.doing)
-        drafted = step.plan or drafted
-    return drafted
+    steps = fit_plan(drafted, progress)
+    while True:
+        try:
+            report(next(steps).doing)
+        except StopIteration as end:
+            return end.value  # type: ignore[no-any-return]
 
 
 def _combined(drafted: DraftPlan, choices: Sequence[Sequence[FittedStructure | None]]) -> Iterator[DraftPlan]:

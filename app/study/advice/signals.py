@@ -123,6 +123,13 @@ def signal(message: str | None, series: SignalSeries) -> Signal:
     )
 
 
+def rate_of(t: np.ndarray) -> float:
+    """Return the sample rate from the median interval, which gaps do not change; NaN without two times."""
+    intervals = np.diff(t)
+    intervals = intervals[intervals > 0]
+    return 1e9 / float(np.median(intervals)) if intervals.size else np.nan
+
+
 def comes_by_chance(one: Signal, recorded: np.ndarray) -> bool:
     """Return whether a signal is often away for long, beyond its rate, while the recording goes on at `recorded`."""
     t = one.series.t

@@ -17,7 +17,8 @@ from sources.worker_process import IsolatedReader
 
 from ...engine.jobs import CANCELLED, CANCELLING, DONE, FAILED, RUNNING, Job
 from ...study.advice.draft import check_new
-from ...study.log_overview import DraftStep, LogOverview, draft, overview
+from ...study.advice.draft_fit import DraftStep
+from ...study.log_overview import LogOverview, draft, overview
 from ...twin.log_match import LogHeader, TwinMatch, match_log
 from ...twin.source import KEY, kind_of
 from ...twin.sources.kind import find_databases
@@ -219,10 +220,10 @@ class DroppedLogs:
         if self._draft is None:
             return {"state": "none"}
         twin, job = self._draft
-        step: DraftStep | None = job.item
-        known = {"doing": step.doing if step else "starting", "summary": step.summary if step else ""}
+        step: DraftStep = job.item or DraftStep("starting")
         error = None if job.error is None else self._words(job.error)
         state = STOPPED_STATES.get(job.state, job.state)
+        known = {"doing": step.doing, "summary": step.summary}
         return {"state": state, "twin": twin, "seconds": job.seconds, "error": error, **known}
 
     def stop_draft(self) -> dict[str, Any]:
