@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import replace
 from typing import Any, NamedTuple
 
@@ -104,19 +104,25 @@ def tidy(seconds: float) -> float:
 def timed(
     twin: Twin, estimator: str, events: Events, seed: int, budget: float, enough: float = MIN_TIMED_S
 ) -> tuple[Fold, float]:
-    """Fold the events, or what the budget (s) allows; a short fold again and again, as other work disturbs it.
-
-    The fold comes with the shortest time an event, s of one processor.
-    """
+    """Return a fold of the events, or of those that the budget allows, and its seconds an event: see `fold_within`."""
     log = Log.resume(twin.model, None, events)
     tuning = replace(twin.tuning.with_options(twin.options_of(estimator)), seed=seed)
     fold = Fold(estimator, twin.model, tuning, log, pairs=twin.pairs, policy=twin.policy, expected=twin.expected)
-    took: list[float] = []
+    return fold, fold_within(fold, budget, enough)
+
+
+def fold_within(fold: Fold, budget: float, enough: float = 0.0, check: Callable[[], object] = lambda: None) -> float:
+    """Fold what a budget (s) allows, and again for `enough` seconds, as other work disturbs a short fold.
+
+    `check` is called now and then, and may raise. Return the shortest time an event, s of one processor.
+    """
+    log, took = fold.log, list[float]()
     while not took or (sum(took) < enough and fold.n == log.n):
         fold.rewind(0)
         begun = time.process_time()
         limit, spent = 1, 0.0
         while fold.advance(limit if np.isfinite(budget) else None) and spent < budget:
+            check()
             spent = time.process_time() - begun
             # What the rest of the budget allows, judged by what was folded; not more than that again.
             limit = max(1, int(fold.n * min(1.0, budget / spent - 1.0)))
@@ -127,7 +133,7 @@ def timed(
         took.append(time.process_time() - begun)
         if fold.failure is not None:
             raise fold.failure
-    return fold, min(took) / fold.n
+    return min(took) / max(1, fold.n)
 
 
 def outcome_of(fold: Fold, events: Events, seconds: float, scored: tuple[int, int] | None = None) -> Outcome:

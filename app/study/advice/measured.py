@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-import time
 from collections.abc import Callable, Mapping, Sequence
 from concurrent.futures import Executor
 from dataclasses import dataclass, field, replace
@@ -27,9 +26,9 @@ from estimators.model.state_space import StateSpaceModel
 from estimators.registry import find_entry, unfit
 
 from ...twin.twin import Twin
+from ..compare import fold_within
 
 BUDGET_S = 20.0  # seconds of one processor for a fold; of a log that takes longer the first part is folded
-TRIED = 64  # events folded at first, to know how long one takes
 MAX_EXCLUDED_SHARE = 0.5  # of a row's readings in faults: with more, not the sensor is wrong but the twin
 
 
@@ -180,19 +179,11 @@ class Measured:
         twin, log = self.twin, self.log
         tuning = replace(twin.tuning, baseline=None).with_options(options)
         fold = Fold(estimator, twin.model, tuning, log.copy(), policy=twin.policy, expected=twin.expected)
-        begun = time.process_time()
-        limit, spent = TRIED, 0.0
-        while fold.n < log.n and spent < budget and fold.advance(limit):
-            self.progress.check()
-            spent = time.process_time() - begun
-            left = budget / max(spent, 1e-9) - 1.0
-            limit = int(min(log.n, max(1.0, fold.n * min(left, 4.0))))
-        if fold.failure is not None:
-            raise fold.failure
+        seconds = fold_within(fold, budget, check=self.progress.check)
         # The fold ends where the budget ended.
         fold.log.n = fold.n
         readings = int(np.sum(log.kind[: fold.n] == READING))
-        return TimedFold(fold, (time.process_time() - begun) / max(1, readings))
+        return TimedFold(fold, seconds * fold.n / max(1, readings))
 
 
 def likelihood_of(fold: Fold, n: int) -> float:

@@ -10,7 +10,7 @@ import numpy as np
 from config.tunings import named
 from estimators.diagnostics.calibration import LIMITS, Calibration, calibrations
 from estimators.diagnostics.score import nis_verdict
-from estimators.diagnostics.sensitivity.checklist import DIFFERENCE_QUANTILE, Linearity
+from estimators.diagnostics.sensitivity.checklist import DIFFERENCE_QUANTILE, MAX_PROCESSOR_SHARE, Linearity
 from estimators.diagnostics.sensitivity.gramian import MAX_PRIOR_LEFT
 from estimators.diagnostics.sensitivity.posterior import FAR_SIGMA, FREQUENT_SHARE, HEAVY_KURTOSIS, MOST_STATES
 from estimators.diagnostics.sensitivity.posterior import tails as measure_tails
@@ -47,7 +47,6 @@ MAX_UNEVEN_SHARE = 0.001  # share of the intervals that may differ: a fixed gain
 MAX_LARGER_INNOVATION = 0.01  # share by which weights may increase the mean innovation; more where the asset jumps
 MIN_DOF = 3.0  # of Student's t, below which it hardly has a variance; its kurtosis is finite above 4
 OPERATIONS_PER_S = 1e9  # order of magnitude for one processor in small dense matrices
-MAX_PROCESSOR_SHARE = 0.5  # of one processor that an estimate may take; the rest is for late readings and refolds
 
 MEMBERS = (20.0, 40.0, 80.0)
 RADIUS_SHARES = (0.05, 0.1, 0.2, 0.4)  # radii that are tried, as shares of the extent of the field
