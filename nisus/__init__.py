@@ -70,6 +70,12 @@ sys.meta_path.insert(0, SecondNames())
 
 
 def __getattr__(name: str) -> Any:
+    if name == "__all__":  # of `help` and `from nisus import *`
+        return import_module("nisus.estimators").__all__
     if name.startswith("__"):
         raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
     return import_module(f"{__name__}.{name}") if name in PACKAGES else getattr(import_module("nisus.estimators"), name)
+
+
+def __dir__() -> list[str]:
+    return sorted({*globals(), *PACKAGES, *import_module("nisus.estimators").__all__})

@@ -1,6 +1,7 @@
 """The wheel has every file of the packages, whatever `package-data` of pyproject.toml says, all in one package."""
 
 import os
+import re
 import shutil
 import subprocess
 import sys
@@ -39,11 +40,14 @@ def test_the_wheel_has_all_files_of_the_packages(built):
     names, wheel = built
     with ZipFile(wheel) as file:
         packed = set(file.namelist())
+        texts = {name: file.read(name).decode() for name in packed if name.endswith(".py")}
     wanted = {f"nisus/{name}" for name in names if name.startswith(tuple(f"{package}/" for package in PACKAGES))}
     wanted |= {name for name in names if name.startswith("nisus/")}
     assert "nisus/py.typed" in wanted
     assert sorted(name for name in wanted - packed if not name.startswith("nisus/config/pictures/")) == []
     assert {name.split("/")[0] for name in packed if ".dist-info/" not in name} == {"nisus", "nisus-0.1.0.data"}
+    former = re.compile(rf"\b(?:from|import) (?:{'|'.join(PACKAGES)})[. ]")  # also in the models that it writes
+    assert [name for name, text in texts.items() if former.search(text)] == []
 
 
 def test_an_installation_stands_beside_packages_of_the_same_names(built, tmp_path):
@@ -84,7 +88,8 @@ def test_a_module_of_a_checkout_is_loaded_once_and_keeps_its_name():
 
     assert nisus.estimators.errors is estimators.errors
     assert estimators.errors.__spec__.name == "estimators.errors" == estimators.errors.ConfigError.__module__
-    assert nisus.fold is estimators.fold
+    assert nisus.fold is estimators.fold and {"app", "fold", "StateSpaceModel"} <= {*dir(nisus)}
+    assert nisus.__all__ is estimators.__all__
     with pytest.raises(AttributeError, match="no attribute 'flod'"):
         nisus.flod  # noqa: B018
 

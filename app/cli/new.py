@@ -75,7 +75,7 @@ level' = (delivery · speed - outlet · valve · √level) / area,   delivery' =
 
 import math
 
-from estimators.model import Input, Noise, Parameter, Row, Sensor, State, StateSpaceModel
+from nisus import Input, Noise, Parameter, Row, Sensor, State, StateSpaceModel
 
 # Every function is written for ONE state and fills `out`. x: states, u: inputs, p: parameters, in the order below.
 # They are compiled, with the functions that they call: keep to numbers, math and loops; other names must be constants.

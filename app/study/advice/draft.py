@@ -181,7 +181,7 @@ def python_text(name: str, model: str, drafted: DraftPlan) -> str:
     uses_math = "import math\n\n" if parameters else ""
     return f'''"""Signals of a recording, each with its own motion: a start for equations that couple them."""
 
-{uses_math}from estimators.model import {", ".join(names)}
+{uses_math}from nisus import {", ".join(names)}
 
 # Every function is written for ONE state and fills `out`. x: states, u: inputs, p: parameters, in the order below.
 # They are compiled, so keep to numbers, math and loops; names outside the function must be constants.

@@ -24,7 +24,7 @@ class UdpSource:
     live = utc = True
 
     def __init__(self, opening):
-        from app.twin.sources.push import messages_of
+        from nisus.app.twin.sources.push import messages_of
 
         self._messages, self._report = messages_of(opening), opening.report
         self.read, self.now = self._messages.read, self._messages.now
@@ -59,7 +59,7 @@ class UdpOutput:
     name = "udp"
 
     def __init__(self, section, engine, secrets):
-        from app.engine.copies import OutputLink
+        from nisus.app.engine.copies import OutputLink
 
         self._address, self._socket = (section.host, section.port), socket.socket(type=socket.SOCK_DGRAM)
         self.link = lambda: OutputLink(True, f"{section.host}:{section.port}")
