@@ -70,9 +70,7 @@ sys.meta_path.insert(0, SecondNames())
 
 
 def __getattr__(name: str) -> Any:
-    if name == "__all__":  # of `help` and `from nisus import *`
-        return import_module("nisus.estimators").__all__
-    if name.startswith("__"):
+    if name.startswith("__") and name != "__all__":  # which `help` and `from nisus import *` read
         raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
     return import_module(f"{__name__}.{name}") if name in PACKAGES else getattr(import_module("nisus.estimators"), name)
 
