@@ -38,13 +38,13 @@ def report_damage(folder: str) -> None:
 
 
 class ContentLocator(caching._SourceFileBackedLocatorMixin, caching._CacheLocator):  # type: ignore[misc]
-    """Locates the cache of a function by the content of its source file."""
+    """Locates the cache of a function by the content of its source file, and by `nisus.` in an installation."""
 
     def __init__(self, function: Any, file: str) -> None:
         path = Path(file).resolve()
         inside = path.is_relative_to(ROOT)
         folder = str(path.parent.relative_to(ROOT)) if inside else self.get_suitable_cache_subpath(file)
-        self._path = os.path.join(config.CACHE_DIR, folder.replace(os.sep, "."))
+        self._path = os.path.join(config.CACHE_DIR, __name__.partition("estimators")[0] + folder.replace(os.sep, "."))
         self._stamp = hashlib.sha256(path.read_bytes()).hexdigest()
         self._lineno = function.__code__.co_firstlineno
 
