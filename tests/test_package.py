@@ -66,7 +66,7 @@ def test_an_installation_stands_beside_packages_of_the_same_names(built, tmp_pat
         from nisus.app.cli.main import main
         from nisus.estimators.model.user_file import run_file
         from nisus.estimators.numerics.cache_entries import ContentLocator, __file__ as file
-        assert ContentLocator(main, file).get_cache_path().endswith("/nisus.estimators.numerics")  # not a checkout's
+        assert ContentLocator(main, file).get_cache_path().endswith("nisus.estimators.numerics")  # not a checkout's
         assert main(["twins"]) == 0
         model = run_file("model", Path("model.py"))
         assert model.State is nisus.estimators.State and model.ConfigError is nisus.estimators.errors.ConfigError
