@@ -53,7 +53,8 @@ _HOMES = {
     **dict.fromkeys(("StateSpaceModel", "Stuck"), "model"),
 }
 
-__all__ = ["fold", *_HOMES]
+if not TYPE_CHECKING:  # type checkers have the names above
+    __all__ = ["fold", *_HOMES]
 
 
 def __getattr__(name: str) -> Any:
@@ -63,7 +64,7 @@ def __getattr__(name: str) -> Any:
 
 
 def __dir__() -> list[str]:
-    return sorted({*globals(), *__all__})
+    return sorted({*globals(), "fold", *_HOMES})
 
 
 class _Package(ModuleType):

@@ -105,3 +105,10 @@ def test_a_foreign_package_in_the_place_of_one_of_nisus_is_named(tmp_path):
         f"ImportError: {tmp_path / 'config.py'} is in the place of config of Nisus; use an environment of its own"
     )
     assert done.stderr.splitlines()[-1] == expected
+
+
+def test_a_type_checker_knows_what_scripts_import(tmp_path):
+    api = pytest.importorskip("mypy.api")
+    (script := tmp_path / "script.py").write_text("from nisus import Log\nwrong: int = Log")
+    out, _, _ = api.run([str(script)])
+    assert 'expression has type "type[Log]"' in out
