@@ -84,22 +84,16 @@ Kind = Literal[
     "commands", "sources", "outputs", "receivers", "models", "corrections", "executors", "tables", "folders", "tracks",
     "archives", "pictures", "routes", "panels",
 ]  # fmt: skip
-RESERVED: Mapping[str, tuple[str, ...]] = {
+RESERVED: Mapping[Kind, tuple[str, ...]] = {
     "sources": ("simulator", "can", "can_log", "table", "merged", "push"),
     "outputs": ("every", "covariance", "receivers"),
     "receivers": ("webhook",),
     "models": ("matrices",),
 }
-"""Names of the core by kind, which no extension may take; commands of the core come before those of one name."""
+"""Names of the core in each kind of section, which no extension may take; commands of the core come before others."""
 
 GUARDED = ("commands", "sources", "outputs", "receivers", "models", "routes", "panels")
 """Kinds whose functions end in a line, not in a traceback; see `maker`."""
-
-SECTIONS: tuple[Kind, ...] = ("sources", "outputs", "receivers", "models")
-"""Kinds whose schema is a section of the YAML."""
-
-TAGGED = ("sources", "receivers")
-"""Kinds of which a section is recognised by its `type`, a literal that is the name of the part."""
 
 _left_out: dict[str, str] = {}
 
@@ -149,18 +143,15 @@ def registered(kind: Kind) -> dict[str, tuple[str, Part]]:
 @cache
 def schemas(kind: Kind) -> dict[str, Any]:
     """Return the classes of options or sections of a kind by name, without those that cannot be imported or used."""
-    found = {}
-    for key, (name, part) in registered(kind).items():
-        schema = _tried(name, partial(_usable, part.schema, kind, key))
-        if schema is not None:
-            found[key] = schema
-    return found
+    parts = registered(kind).items()
+    found = {key: _tried(name, partial(_usable, part.schema, kind, key)) for key, (name, part) in parts}
+    return {key: schema for key, schema in found.items() if schema is not None}
 
 
 def _usable(reference: str, kind: Kind, key: str) -> Any:
     """Return a class of options or sections; one that would stop every twin is refused."""
     schema = pkgutil.resolve_name(reference)
-    if kind in SECTIONS:
+    if kind in RESERVED:
         from .channels import MessagesSection  # here, as commands without a YAML do not wait for pydantic
         from .fields import Section
 
@@ -170,7 +161,8 @@ def _usable(reference: str, kind: Kind, key: str) -> Any:
         if kind == "outputs" and (key[:1] == "_" or hasattr(base, key)):
             raise TypeError(f"{key} is a name of pydantic")
         schema.model_rebuild()
-        if kind in TAGGED and get_args(schema.model_fields["type"].annotation) != (key,):
+        # Such a section is recognised by its type.
+        if kind in ("sources", "receivers") and get_args(schema.model_fields["type"].annotation) != (key,):
             raise TypeError(f"type of {schema.__name__} is not Literal[{key!r}]")
         if kind == "models" and key not in schema.model_fields:
             raise TypeError(f"{schema.__name__} has no field {key}")
@@ -179,7 +171,7 @@ def _usable(reference: str, kind: Kind, key: str) -> Any:
 
 def leave_out_undescribed() -> None:
     """Leave out the sections that have no JSON Schema; for `nisus schema`, before it imports the schema of twins."""
-    for kind in SECTIONS:
+    for kind in RESERVED:
         for key, schema in [*schemas(kind).items()]:
             if _tried(registered(kind)[key][0], schema.model_json_schema) is None:
                 del schemas(kind)[key]
@@ -218,11 +210,8 @@ def maker(kind: Kind, key: str, asked: str = "", extra: str = "") -> Callable[..
 
 def made(kind: Kind, *given: Any) -> list[Any]:
     """Return what the functions of all parts of a kind make; what fails is reported, and left out."""
-
-    def one(key: str) -> Any:
-        return maker(kind, key)(*given)
-
-    tried = (_tried(name, partial(one, key)) for key, (name, _) in registered(kind).items())
+    parts = registered(kind).items()
+    tried = (_tried(name, partial(lambda key: maker(kind, key)(*given), key)) for key, (name, _) in parts)
     return [found for found in tried if found is not None]
 
 

@@ -6,7 +6,6 @@ import os
 import re
 from collections.abc import Mapping
 from dataclasses import dataclass
-from importlib import resources
 from pathlib import Path
 from typing import Any
 
@@ -14,7 +13,7 @@ from estimators.errors import ConfigError, nearest
 
 from .companion_schema import TuningSection, VersionSection
 from .problems import check_section
-from .yaml_files import Key, ValuePlaces, read_text, shown_path
+from .yaml_files import TWINS, Key, ValuePlaces, read_text, shown_path
 
 OWN_VALUES = "own"  # Name of the values in the twin's own file
 
@@ -22,8 +21,7 @@ NAME = re.compile(r"[A-Za-z0-9][A-Za-z0-9_.-]{0,59}")
 
 SPREADS = ("variance", "std")  # Alternatives: one replaces the other
 
-_CONFIG = Path(str(resources.files(__package__)))
-SHIPPED = _CONFIG / "tunings"  # Folder of the versions that ship, a folder for each twin
+SHIPPED = TWINS.parent / "tunings"  # Folder of the versions that ship, a folder for each twin
 
 
 @dataclass(frozen=True)
@@ -45,7 +43,7 @@ class Version:
 
 def ships(twin: Path) -> bool:
     """Return whether a twin's YAML is one of those that ship."""
-    return twin.resolve().parent == (_CONFIG / "twins").resolve()
+    return twin.resolve().parent == TWINS
 
 
 def named(twin: Path) -> str:

@@ -49,8 +49,7 @@ _HOMES = {
     "fuse": "fusion",
     "mean_nees": "diagnostics.consistency",
     "rk4": "model.rk4",
-    **dict.fromkeys(("Field", "Input", "Jump", "Limits", "Noise", "Parameter", "Row", "Sensor", "State"), "model"),
-    **dict.fromkeys(("StateSpaceModel", "Stuck"), "model"),
+    **dict.fromkeys("Field Input Jump Limits Noise Parameter Row Sensor State StateSpaceModel Stuck".split(), "model"),
 }
 
 if not TYPE_CHECKING:  # type checkers have the names above

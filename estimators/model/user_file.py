@@ -46,8 +46,7 @@ def _guard(function: Callable[..., Any]) -> Callable[..., Any]:
     return guarded
 
 
-OWN = ("nisus", "estimators", "sources", "config", "app")
-OWN_PACKAGES = [Path(__file__).resolve().parents[2] / name for name in OWN]
+OWN_PACKAGES = [Path(__file__).resolve().parents[2] / name for name in "nisus estimators sources config app".split()]
 
 
 def imported_beside(path: Path) -> tuple[Path, ...]:
