@@ -20,52 +20,7 @@ if TYPE_CHECKING:
 
 MAX_OMISSION_TEXT = 200  # characters of a line of omitted signals
 
-_YAML = """\
-# {name}: a tank that a pump fills and a valve empties. Change it, and {name}.py beside it, into a twin of your own.
-#
-# Source: simulated; the true pump delivers less than the model expects, as a worn one does.
-# Expect: the level within a few millimetres from the start, better than its sensor's 10 mm. The pump's delivery, which
-# no sensor measures, is found within ten seconds, 15 % below its prior.
-# Run it: nisus run {name}.yaml      Score it: nisus fold {name}.yaml      Every key: nisus schema
-title: Level of a tank and delivery of its pump
-model: ./{name}.py:{model}       # file beside this one, and the name of the model in it
-
-parameters:                      # constants of the model
-  area: 0.5                         # m², base of the tank
-  outlet: 0.02                      # m²·√m/s, outflow through the open valve at one metre of level
-
-prior:                           # estimate before the first measurement
-  level: {mean: 1.0, std: 0.3}      # m
-  delivery: {mean: 0.0010, std: 0.0003}  # m³ a turn
-
-noise:                           # model uncertainty, per second
-  level: {std: 0.001}               # m
-  delivery: {std: 0.000002}         # m³
-
-sensors:                         # sensor noise
-  level: {std: 0.01}                # m
-  outflow: {std: 0.0005, use: true} # m³/s; use: false holds it out, and scores its predictions
-
-estimator: ekf                   # kf, ekf, ukf
-gate: 0.9999                     # probability that a good measurement passes; null uses all
-
-source:
-  type: simulator
-  seed: 1
-  step: 0.5                      # s
-  duration: 600                  # s
-  initial: {level: 0.8, delivery: 0.00085}  # true state at the start
-  inputs:
-    speed: {sine: {mean: 15, amplitude: 5, period: 90}}                 # turns/s
-    valve: {steps: [[0, 0.5], [60, 0.8], [180, 0.4], [300, 0.7]], repeat: 420}  # opening, 0 to 1
-  sensors:
-    level: {every: 1}            # one reading a step
-    outflow: {every: 4, drop_every: 10}  # a slower sensor that loses one reading in ten
-
-view:
-  pairs: [[level, delivery]]     # covariance ellipse
-  window: 120                    # s that the charts show
-"""
+_YAML = Path(__file__).with_name("new.yaml").read_text(encoding="utf-8")
 
 _PYTHON = '''\
 """A tank that a pump fills and a valve empties.

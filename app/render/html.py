@@ -6,6 +6,8 @@ import time
 from collections.abc import Sequence
 from html import escape
 from importlib.metadata import PackageNotFoundError, version
+from pathlib import Path
+from string import Template
 
 import numpy as np
 
@@ -16,27 +18,8 @@ from ..result import WORSE, Bar, Topic
 NO_WRAP = 24
 """Characters up to which a cell stays on one line."""
 
-POLICY = "default-src 'none'; script-src 'unsafe-inline' data:; style-src 'unsafe-inline'; img-src data:"
-"""Of HTML results: scripts and styles in the file, nothing from elsewhere."""
-
-STYLE = """
-@page { size: A4; margin: 14mm }
-body { font: 14px/1.45 system-ui, sans-serif; color: #1f2937; background: #fff; max-width: 62em; margin: 2em auto;
-       padding: 0 1.5em }
-h1 { font-size: 1.5em; margin: 0 0 .2em } h2 { font-size: 1.1em; margin: 1.8em 0 .4em; break-after: avoid }
-p { margin: .3em 0 }
-table { border-collapse: collapse; width: 100%; font-size: .9em; font-variant-numeric: tabular-nums }
-th, td { text-align: left; vertical-align: top; padding: .35em .7em .35em 0; border-bottom: 1px solid #e5e7eb }
-th { color: #6b7280; font-weight: 500 }
-tr, svg { break-inside: avoid }
-.good { color: #15803d } .partly { color: #b45309 } .bad { color: #b91c1c }
-.good, .partly, .bad { font-weight: 600 }
-.short { white-space: nowrap }
-.worse { color: #b91c1c }
-svg { display: block; margin: .6em 0; max-width: 100%; height: auto }
-.small { color: #6b7280; font-size: .85em }
-@media print { body { font-size: 10.5px; max-width: none; margin: 0; padding: 0 } }
-"""
+PAGE = Template(Path(__file__).with_name("result.html").read_text(encoding="utf-8"))
+"""Scripts and styles are in the file; its security policy forbids to load anything from elsewhere."""
 
 ROW_PX, NAMES_PX, BAR_PX = 34, 150, 420
 """Height of a pair of bars, width of the names, length of the longest bar."""
@@ -46,7 +29,7 @@ RED_CLASS = ' class="worse"'
 
 
 def to_html(title: str, topics: Sequence[Topic], *, now: float | None = None) -> str:
-    """Return one HTML page that needs no other file; its security policy forbids to load anything.
+    """Return one HTML page that needs no other file.
 
     The first topic is the head of the page. `now` is the time of writing, s since 1970, UTC; None means now.
     """
@@ -55,14 +38,7 @@ def to_html(title: str, topics: Sequence[Topic], *, now: float | None = None) ->
     body += _content(head)
     for topic in others:
         body += [f"<h2>{escape(topic.title)}</h2>", *_sentences(topic), *_content(topic)]
-    return (
-        '<!DOCTYPE html>\n<html lang="en">\n<head>\n<meta charset="utf-8">\n'
-        f'<meta http-equiv="Content-Security-Policy" content="{POLICY}">\n'
-        '<meta name="viewport" content="width=device-width, initial-scale=1">\n'
-        f"<title>{escape(title)}</title>\n<style>{STYLE}</style>\n</head>\n<body>\n"
-        + "\n".join(body)
-        + "\n</body>\n</html>\n"
-    )
+    return PAGE.substitute(title=escape(title), body="\n".join(body))
 
 
 def stamp(now: float | None = None) -> str:
