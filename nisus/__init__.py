@@ -9,9 +9,11 @@ from __future__ import annotations
 import sys
 import warnings
 from collections.abc import Sequence
+from functools import cache
 from importlib import import_module
 from importlib.abc import Loader, MetaPathFinder
 from importlib.machinery import ModuleSpec, PathFinder
+from importlib.util import find_spec
 from pathlib import Path
 from types import ModuleType
 from typing import TYPE_CHECKING, Any
@@ -38,10 +40,9 @@ class SecondNames(MetaPathFinder, Loader):
 
     def create_module(self, spec: ModuleSpec) -> ModuleType:
         """Return the module of the other name."""
+        if not INSTALLED:
+            refuse_others()
         module = import_module(first_name(spec.name))
-        if not INSTALLED and not Path(module.__file__ or "").resolve().is_relative_to(ROOT):
-            own = spec.name.partition(".")[2]
-            raise ImportError(f"{module.__file__} is in the place of {own} of Nisus; use an environment of its own")
         spec.loader_state = module.__spec__
         return module
 
@@ -64,6 +65,25 @@ def first_name(name: str) -> str:
         return ""
     warnings.warn(f"write nisus.{name} for {name}, which the next version does not find", FutureWarning, stacklevel=3)
     return f"{__name__}.{name}"
+
+
+@cache
+def refuse_others() -> None:
+    """Raise an ImportError that names the file which would be imported in the place of a package of the checkout."""
+    for name in PACKAGES:
+        place = getattr(find_spec(name), "origin", None) or ""
+        if not Path(place).resolve().is_relative_to(ROOT / name):
+            raise ImportError(f"{place} is in the place of {name} of Nisus; use an environment of its own")
+
+
+def main() -> int:
+    """Run the command `nisus`; what keeps it from being imported is one line."""
+    try:
+        command = import_module(f"{__name__}.app.cli.main").main
+    except ImportError as error:
+        print(f"nisus: {error}", file=sys.stderr)
+        return 2
+    return int(command())
 
 
 sys.meta_path.insert(0, SecondNames())

@@ -96,15 +96,16 @@ def test_a_module_of_a_checkout_is_loaded_once_and_keeps_its_name():
         nisus.flod  # noqa: B018
 
 
-def test_a_foreign_package_in_the_place_of_one_of_nisus_is_named(tmp_path):
-    (tmp_path / "config.py").touch()
-    command = [sys.executable, "-c", "import nisus.config"]
+@pytest.mark.parametrize("name", PACKAGES)
+def test_a_foreign_package_in_the_place_of_one_of_nisus_is_named(name, tmp_path):
+    (tmp_path / f"{name}.py").touch()
     environment = os.environ | {"PYTHONPATH": os.pathsep.join([str(tmp_path), str(ROOT)])}
-    done = subprocess.run(command, cwd=tmp_path, env=environment, capture_output=True, text=True)
-    expected = (
-        f"ImportError: {tmp_path / 'config.py'} is in the place of config of Nisus; use an environment of its own"
-    )
-    assert done.stderr.splitlines()[-1] == expected
+    said = f"{tmp_path / name}.py is in the place of {name} of Nisus; use an environment of its own"
+    for code, line in (("import nisus.config", f"ImportError: {said}"), ("exit(nisus.main())", f"nisus: {said}")):
+        command = [sys.executable, "-c", f"import nisus; {code}"]
+        done = subprocess.run(command, cwd=tmp_path, env=environment, capture_output=True, text=True)
+        assert done.stderr.splitlines()[-1] == line
+    assert done.returncode == 2 and done.stderr.count("\n") == 1
 
 
 def test_a_type_checker_knows_what_scripts_import(tmp_path):
