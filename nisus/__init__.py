@@ -14,6 +14,7 @@ from importlib import import_module
 from importlib.abc import Loader, MetaPathFinder
 from importlib.machinery import ModuleSpec, PathFinder
 from importlib.util import find_spec
+from multiprocessing import parent_process
 from pathlib import Path
 from types import ModuleType
 from typing import TYPE_CHECKING, Any
@@ -63,7 +64,9 @@ def first_name(name: str) -> str:
         return f"{__name__}.{name}" if sys.modules[first] is sys.modules.get(f"{__name__}.{first}") else ""
     if PathFinder.find_spec(name) is not None:
         return ""
-    warnings.warn(f"write nisus.{name} for {name}, which the next version does not find", FutureWarning, stacklevel=3)
+    if parent_process() is None:  # once for all processes of a command
+        text = f"write nisus.{name} for {name}, which the next version does not find"
+        warnings.warn(text, FutureWarning, stacklevel=3)
     return f"{__name__}.{name}"
 
 

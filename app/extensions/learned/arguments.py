@@ -17,7 +17,7 @@ class LearnCommand(JsonOption, EstimatorOption, TwinOptions):
     Exit status: 0 if the correction is better there, 1 if not; then nothing is written.
 
     Examples:
-      nisus learn motor_bench --corrects magnet --features speed,i_d,i_q --kind ridge
+      nisus learn motor_bench_hybrid --corrects magnet --features speed,i_d,i_q --kind ridge
     """
 
     corrects: str
