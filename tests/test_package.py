@@ -84,9 +84,8 @@ def test_an_installation_stands_beside_packages_of_the_same_names(built, tmp_pat
 
 
 def test_a_module_of_a_checkout_is_loaded_once_and_keeps_its_name():
-    import nisus.estimators.errors
-
     import estimators.errors
+    import nisus.estimators.errors
 
     assert nisus.estimators.errors is estimators.errors
     assert estimators.errors.__spec__.name == "estimators.errors" == estimators.errors.ConfigError.__module__

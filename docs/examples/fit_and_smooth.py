@@ -6,11 +6,11 @@ Run: python docs/examples/fit_and_smooth.py
 """
 
 import numpy as np
+
+from nisus import fold
 from nisus.app.twin.log_reader import read_log
 from nisus.app.twin.twin import load_twin
 from nisus.estimators.smoothing.em import em
-
-from nisus import fold
 
 
 def fit_and_smooth(name="motor_can"):

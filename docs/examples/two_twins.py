@@ -8,11 +8,11 @@ Run: python docs/examples/two_twins.py
 """
 
 import numpy as np
+
+from nisus import Log, Noise, StateSpaceModel, covariance_intersection, fold
 from nisus.app.twin.log_reader import read_log
 from nisus.app.twin.twin import load_twin
 from nisus.estimators.log import READING, TRUTH, Events
-
-from nisus import Log, Noise, StateSpaceModel, covariance_intersection, fold
 
 SHARED = ["winding", "tooth", "yoke"]
 
