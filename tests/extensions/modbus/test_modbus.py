@@ -1,6 +1,7 @@
 """Registers of a Modbus TCP device: numbers of all types, blocks, refused registers, and a device that comes back."""
 
 import struct
+from contextlib import closing
 
 import numpy as np
 import pytest
@@ -15,11 +16,18 @@ from tests.waiting import wait_for
 FORMATS = dict(int16="h", uint16="H", int32="i", uint32="I", int64="q", uint64="Q", float32="f", float64="d")
 
 
+@pytest.fixture
+def device():
+    made = Device()
+    yield made
+    made.stop()
+
+
 def source(served, registers, report=lambda key, text: None, **given):
     channels = [Channel(READING, k, name, (name,), model_units=("1",)) for k, name in enumerate(registers)]
     messages = Messages(channels, width=1)
     options = {"host": "127.0.0.1", "port": served.port, "device": 1, "period": 0.01, "report": report} | given
-    return ModbusSource(messages, registers, **options)
+    return closing(ModbusSource(messages, registers, **options))
 
 
 def values(reader, want=1):
@@ -37,33 +45,23 @@ def values(reader, want=1):
 
 @pytest.mark.parametrize("words", ["big", "little"])
 @pytest.mark.parametrize(("kind", "code"), FORMATS.items())
-def test_a_number_is_what_the_device_packed(kind, code, words):
+def test_a_number_is_what_the_device_packed(device, kind, code, words):
     value = -12.5 if kind.startswith("float") else 200 if kind.startswith("u") else -200
     data = struct.pack(f">{code}", value)
     if words == "little":  # the registers in reverse, each with its high byte first
         data = b"".join(data[k : k + 2] for k in range(len(data) - 2, -1, -2))
-    device = Device()
     device.give(7, data, "input")
-    reader = source(device, {"a": Register(7, "input", kind, words)}, device=9)
-    try:
+    with source(device, {"a": Register(7, "input", kind, words)}, device=9) as reader:
         assert values(reader) == {0: value}
         assert device.requests[0] == (9, 4, 7, len(data) // 2)
-    finally:
-        reader.close()
-        device.stop()
 
 
-def test_bits_are_zero_and_one():
-    device = Device()
+def test_bits_are_zero_and_one(device):
     device.tables["coil"] = {k: int(k in (3, 11)) for k in range(16)}
     device.tables["discrete"] = {5: 1}
     registers = {"off": Register(2, "coil"), "on": Register(3, "coil"), "far": Register(11, "coil")}
-    reader = source(device, registers | {"other": Register(5, "discrete")})
-    try:
+    with source(device, registers | {"other": Register(5, "discrete")}) as reader:
         assert values(reader, 4) == {0: 0.0, 1: 1.0, 2: 1.0, 3: 1.0}
-    finally:
-        reader.close()
-        device.stop()
 
 
 def test_adjacent_registers_are_one_request_of_at_most_125():
@@ -76,11 +74,11 @@ def test_adjacent_registers_are_one_request_of_at_most_125():
     assert found == [("coil", 1, 2, ("bit",)), ("holding", 0, 4, ("whole", "part"))]
 
 
-def test_what_the_device_refuses_is_missing_and_told():
-    device, told = Device(), []
+def test_what_the_device_refuses_is_missing_and_told(device):
+    told = []
     device.give(1, struct.pack(">H", 42))
-    reader = source(device, {"there": Register(1), "not there": Register(50)}, lambda *line: told.append(line))
-    try:
+    registers = {"there": Register(1), "not there": Register(50)}
+    with source(device, registers, lambda *line: told.append(line)) as reader:
         found = values(reader, 2)
         assert found[0] == 42.0 and np.isnan(found[1])
         key, text = told[0]
@@ -88,26 +86,20 @@ def test_what_the_device_refuses_is_missing_and_told():
             f"the device at 127.0.0.1:{device.port} does not give not there (holding 50 to 50): "
         )
         assert text.endswith("; check address, table and device") and "\n" not in text
-    finally:
-        reader.close()
-        device.stop()
 
 
-def test_a_device_that_goes_and_comes_back_is_read_again():
-    device, told = Device(), []
+def test_a_device_that_goes_and_comes_back_is_read_again(device):
+    told = []
     device.give(1, struct.pack(">H", 1))
-    reader = source(device, {"a": Register(1)}, lambda *line: told.append(line))
-    assert values(reader) == {0: 1.0}
-    device.stop()
-    wait_for(lambda: told)
-    assert told[0][0] == "no broker"
-    assert told[0][1].startswith(f"no measurements from the device at 127.0.0.1:{device.port}: ")
-    while len(reader.read(0.0)):
-        pass
-    again = Device(device.port)
-    again.give(1, struct.pack(">H", 2))
-    try:
+    with source(device, {"a": Register(1)}, lambda *line: told.append(line)) as reader:
+        assert values(reader) == {0: 1.0}
+        device.stop()
+        wait_for(lambda: told)
+        assert told[0][0] == "no broker"
+        assert told[0][1].startswith(f"no measurements from the device at 127.0.0.1:{device.port}: ")
+        while len(reader.read(0.0)):
+            pass
+        again = Device(device.port)
+        again.give(1, struct.pack(">H", 2))
         assert values(reader) == {0: 2.0}
-    finally:
-        reader.close()
-        again.stop()
+    again.stop()
