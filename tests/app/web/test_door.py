@@ -268,14 +268,9 @@ def test_the_scene_is_chosen_and_the_status_tells_it(fresh):
     assert fresh.choices.values() == {"x": "rate"}
 
 
-def test_each_view_has_a_page_of_its_own(page):
-    """Rerun's is without the rest of the page; Viser's is Viser's own, whose socket passes on what it is asked for."""
+def test_the_page_of_rerun_is_without_the_rest(page):
     alone = page.client.get("/explore").text
     assert 'id="rerun"' in alone and 'id="tune"' not in alone and "{{settings}}" not in alone
-    with page.connect("/viser/?theme=dark", subprotocols=["viser-test"]) as socket:
-        socket.send("hello")
-        assert socket.recv(timeout=LIMIT_S) == "hello"
-    assert page.viser.requests[-1] == ("/?theme=dark", [SECRET])
 
 
 def test_visers_client_is_its_own_file_with_a_script_and_a_style_of_ours_and_there_is_no_other(page):
@@ -286,25 +281,18 @@ def test_visers_client_is_its_own_file_with_a_script_and_a_style_of_ours_and_the
     assert page.client.get("/viser/assets/a.js?v=1").status == 404 and not page.viser.requests
 
 
-def test_a_secret_of_the_browser_is_not_passed_on(page):
+def test_viser_messages_pass_both_ways_and_no_secret_of_the_browser(page):
     client = page.client
     headers = {"Cookie": client.cookie, "X-Nisus-Secret": "guess"}
     with connect(
-        f"ws://{client.host}/viser/", origin=client.origin, additional_headers=headers, subprotocols=["viser-test"],
+        f"ws://{client.host}/viser/?a=b", origin=client.origin, additional_headers=headers, subprotocols=["viser-test"],
         proxy=None,
-    ) as socket:  # fmt: skip
-        socket.send("hello")
-        assert socket.recv(timeout=LIMIT_S) == "hello"
-    assert page.viser.requests == [("/", [SECRET])]
-
-
-def test_viser_messages_pass_both_ways(page):
-    with page.connect("/viser/?a=b", subprotocols=["viser-test"]) as stage:
+    ) as stage:  # fmt: skip
         assert stage.subprotocol == "viser-test"
         for message in ("text", b"bytes"):
             stage.send(message)
             assert stage.recv(timeout=LIMIT_S) == message
-    assert page.viser.requests[-1] == ("/?a=b", [SECRET])
+    assert page.viser.requests == [("/?a=b", [SECRET])]
 
 
 # The streams

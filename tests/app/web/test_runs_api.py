@@ -88,8 +88,6 @@ def test_what_the_data_say_is_folded_when_asked(page):
 
 
 def test_yaml_of_a_run_is_text_to_save(page, monkeypatch):
-    from app.twin.twin import load_twin
-
     monkeypatch.setattr(page.engine, "twin", load_twin("motor_winding"))
     page.command("SetTuning", key="Q.rate", value=0.5)
     page.command("Note", number=1, name="fast", note="two\nlines")
