@@ -66,11 +66,8 @@ def test_the_published_state_is_that_of_the_fold_whatever_the_form(page):
         pa.array([(BEGIN + k * SECOND) // 10**6 for k in range(30, 40)], pa.timestamp("ms", tz="UTC")),
     ):
         first = 20 if pa.types.is_integer(times.type) else 30
-        table = pa.table({"time": times, "winding": values[first : first + 10]})
-        sink = pa.BufferOutputStream()
-        with pa.ipc.new_stream(sink, table.schema) as stream:
-            stream.write_table(table)
-        assert sent(page, sink.getvalue().to_pybytes(), ARROW)[1]["accepted"] == 10
+        body = arrow({"time": times, "winding": values[first : first + 10]})
+        assert sent(page, body, ARROW)[1]["accepted"] == 10
     twin = page.engine.twin
     log = measured(twin.model, "winding", BEGIN * 1e-9 + np.arange(40.0), values, start=BEGIN * 1e-9)
     track = fold(twin.estimator, twin.model, log, tuning=twin.tuning)
@@ -149,6 +146,7 @@ def test_a_body_that_cannot_be_read_is_refused_in_one_line(page, body, kind, sta
 
 
 def arrow(columns, compression=None):
+    """The body of a stream of one batch."""
     batch = pa.record_batch(columns)
     sink = pa.BufferOutputStream()
     with pa.ipc.new_stream(sink, batch.schema, options=pa.ipc.IpcWriteOptions(compression=compression)) as stream:
