@@ -41,6 +41,10 @@ def walk(n):
     return readings(*random_walk(n, seed=3, step=0.05))
 
 
+def started(n):
+    return Stepped(n, seed=3, step=0.05).engine
+
+
 def fitted(engine, *request):
     """The attempt at the end of a fit."""
     fitting = Fitting(engine)
@@ -58,7 +62,7 @@ def alone(n):
 def test_a_fit_beside_the_twin_is_the_fit_of_its_log(monkeypatch):
     monkeypatch.setattr(history_copy, "MAX_PULL_ROWS", 4096)
     n = 5000  # more than one chunk is copied
-    engine = Stepped(n, seed=3, step=0.05).engine
+    engine = started(n)
     found, expected = fitted(engine, WANTED), alone(n)
     assert (found.job.state, found.events, found.folds) == (DONE, n, expected.folds)
     assert found.seconds == pytest.approx(0.1 * (n - 1)) and found.job.elapsed > 0.0
@@ -69,14 +73,14 @@ def test_a_fit_beside_the_twin_is_the_fit_of_its_log(monkeypatch):
 
 
 def test_the_last_events_are_folded_from_a_snapshot_on():
-    found = fitted(Stepped(6000, seed=3, step=0.05).engine, WANTED, 3000)
+    found = fitted(started(6000), WANTED, 3000)
     assert found.job.state == DONE and found.fitted.before.fitted.n + found.fitted.before.held_out.n == found.events
     # From the last snapshot at or before the event that was asked for.
     assert 3000 <= found.events < 6000
 
 
 def test_a_data_sheet_bounds_it():
-    engine = Stepped(1500, seed=3, step=0.05).engine
+    engine = started(1500)
     free = alone(1500).lines[1].after
     # R was found below where the data sheet ends.
     bounds = (1.2 * free, FIRST.get("R.winding"))
@@ -86,7 +90,7 @@ def test_a_data_sheet_bounds_it():
 
 
 def test_one_at_a_time():
-    engine = Stepped(600, seed=3, step=0.05).engine
+    engine = started(600)
     fitting = Fitting(engine)
     fitting.begin(WANTED)
     with pytest.raises(ConfigError, match="another one is under way; wait for it, or cancel it"):
@@ -100,7 +104,7 @@ def test_one_at_a_time():
 
 
 def test_a_fit_that_is_cancelled_ends_after_its_current_folds(monkeypatch):
-    engine = Stepped(600, seed=3, step=0.05).engine
+    engine = started(600)
     fitting = Fitting(engine)
     real = Fold.advance
 
@@ -121,17 +125,13 @@ def test_a_fit_that_is_cancelled_ends_after_its_current_folds(monkeypatch):
     [(0, WANTED, "no reading has come yet"), (600, ["Q.nothing"], "Q.nothing is no entry that can be fitted")],
 )
 def test_why_there_is_none(n, wanted, reason):
-    found = fitted(Stepped(n, seed=3, step=0.05).engine, wanted)
+    found = fitted(started(n), wanted)
     assert found.job.state == FAILED and reason in found.job.reason
 
 
 def test_an_empty_request_is_rejected():
     with pytest.raises(ConfigError, match="wanted is empty"):
         Fitting(Stepped().engine).begin([])
-
-
-def started(n):
-    return Stepped(n, seed=3, step=0.05).engine
 
 
 def brute_force(key, n):

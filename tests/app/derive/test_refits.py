@@ -66,6 +66,15 @@ def begin(tmp_path):
     return partial(Refitted, tmp_path)
 
 
+@pytest.fixture
+def offered(begin):
+    """A twin whose first fit, of too small a noise, is proposed."""
+    twin = begin()
+    twin.measure(WINDOW + 1, 5.0)
+    assert twin.look() == OFFERED and twin.refits.open.number == 1
+    return twin
+
+
 def test_nothing_is_fitted_before_a_whole_window_and_then_at_set_times(begin):
     twin = begin()
     assert twin.look() is None
@@ -97,46 +106,40 @@ def test_what_does_not_win_is_not_proposed_and_is_said(begin):
         twin.refits.accept(1)
 
 
-def test_adopted_by_hand_a_version_with_its_evidence_goes_on(begin):
-    twin = begin()
-    twin.measure(WINDOW + 1, 5.0)
-    assert twin.look() == OFFERED and twin.refits.open.number == 1
+def test_adopted_by_hand_a_version_with_its_evidence_goes_on(offered):
     # Nothing was put in, and nothing written.
-    assert twin.engine.revisions.runs[-1].number == 0 and not version_files(twin.twin.path)
-    assert twin.accept(1) == "refit-1"
-    version = load_version(version_files(twin.twin.path)["refit-1"])
-    (line,) = twin.refits.known[0].attempt.fitted.lines
-    assert twin.engine.tuning.get("R.winding") == line.after and line.low < 25.0 < line.high
+    assert offered.engine.revisions.runs[-1].number == 0 and not version_files(offered.twin.path)
+    assert offered.accept(1) == "refit-1"
+    version = load_version(version_files(offered.twin.path)["refit-1"])
+    (line,) = offered.refits.known[0].attempt.fitted.lines
+    assert offered.engine.tuning.get("R.winding") == line.after and line.low < 25.0 < line.high
     evidence = version.head.evidence
     moved = evidence.entries["R.winding"]
     assert (moved.before, moved.after) == (4.0, line.after) and moved.low < 25.0 < moved.high and moved.sigma > 10.0
     assert evidence.gain > 2.0 * evidence.error > 0.0
     assert version.head.scores["log_likelihood"] > evidence.before["log_likelihood"]
     assert "by hand" in version.head.note and version.head.fitted_on[0].startswith("601 events over 60 s, to 61 s")
-    assert [text.split(": ")[:2] for text in twin.refit_notices()] == [
+    assert [text.split(": ")[:2] for text in offered.refit_notices()] == [
         ["refit 1", "proposed"],
         ["refit 1", "adopted by hand as tuning version refit-1"],
     ]
-    assert twin.engine.revisions.runs[-1].why == "refit 1, version refit-1"
+    assert offered.engine.revisions.runs[-1].why == "refit 1, version refit-1"
     # The next one starts from there, and finds nothing to mend.
-    twin.measure(EVERY, 5.0)
-    assert twin.look() == NOTHING and [item.state for item in twin.refits.known] == [ADOPTED, NOTHING]
+    offered.measure(EVERY, 5.0)
+    assert offered.look() == NOTHING and [item.state for item in offered.refits.known] == [ADOPTED, NOTHING]
 
 
-def test_dismissed_it_does_not_come_again_until_the_data_say_something_else(begin):
-    twin = begin()
-    twin.measure(WINDOW + 1, 5.0)
-    assert twin.look() == OFFERED
-    twin.refits.dismiss(1)
-    assert twin.refits.open is None and twin.engine.revisions.runs[-1].number == 0
+def test_dismissed_it_does_not_come_again_until_the_data_say_something_else(offered):
+    offered.refits.dismiss(1)
+    assert offered.refits.open is None and offered.engine.revisions.runs[-1].number == 0
     with pytest.raises(ConfigError, match="refit 1: it is dismissed; only a proposed fit"):
-        twin.refits.accept(1)
+        offered.refits.accept(1)
     for _ in range(2):
-        twin.measure(EVERY, 5.0)
-        assert twin.look() == DISMISSED and twin.refits.open is None
-    assert "the same result was dismissed before" in twin.refit_notices()[-1]
-    twin.measure(WINDOW, 10.0)
-    assert twin.look() == OFFERED and twin.refits.open.number == 4
+        offered.measure(EVERY, 5.0)
+        assert offered.look() == DISMISSED and offered.refits.open is None
+    assert "the same result was dismissed before" in offered.refit_notices()[-1]
+    offered.measure(WINDOW, 10.0)
+    assert offered.look() == OFFERED and offered.refits.open.number == 4
 
 
 def test_adopted_by_rule_is_said_too(begin, tmp_path):
@@ -159,24 +162,18 @@ def test_what_cannot_be_kept_waits_and_is_said(begin, tmp_path):
     assert twin.accept(1) == "refit-1"
 
 
-def test_a_proposal_holds_for_the_tuning_that_it_was_fitted_from(begin):
-    twin = begin()
-    twin.measure(WINDOW + 1, 5.0)
-    assert twin.look() == OFFERED
-    twin.submit(SetTuning("R.winding", 20.0))
+def test_a_proposal_holds_for_the_tuning_that_it_was_fitted_from(offered):
+    offered.submit(SetTuning("R.winding", 20.0))
     with pytest.raises(ConfigError, match="refit 1: it is outdated"):
-        twin.refits.accept(1)
-    assert "another tuning runs by now" in twin.refit_notices()[-1]
-    assert not version_files(twin.twin.path) and twin.engine.tuning.get("R.winding") == 20.0
+        offered.refits.accept(1)
+    assert "another tuning runs by now" in offered.refit_notices()[-1]
+    assert not version_files(offered.twin.path) and offered.engine.tuning.get("R.winding") == 20.0
 
 
-def test_a_newer_proposal_takes_the_place_of_the_older(begin):
-    twin = begin()
-    twin.measure(WINDOW + 1, 5.0)
-    twin.look()
-    twin.measure(WINDOW, 9.0)
-    assert twin.look() == OFFERED
-    assert [item.state for item in twin.refits.known] == [OUTDATED, OFFERED] and twin.refits.open.number == 2
+def test_a_newer_proposal_takes_the_place_of_the_older(offered):
+    offered.measure(WINDOW, 9.0)
+    assert offered.look() == OFFERED
+    assert [item.state for item in offered.refits.known] == [OUTDATED, OFFERED] and offered.refits.open.number == 2
 
 
 def test_the_engine_goes_on_if_a_fit_fails(begin, monkeypatch):
