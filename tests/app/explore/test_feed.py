@@ -59,6 +59,16 @@ class Fed(Stepped):
                 self.pieces = []
         return messages
 
+    def show(self, *batches):
+        """Fold measurements, and take what the viewer is fed then."""
+        self.put(*batches)
+        self.next()
+
+    def retune(self):
+        """Begin another revision, and take what the viewer is fed of it."""
+        self.submit(commands.SetTuning("Q.temperature", 5.0))
+        self.next()
+
     def chunks(self, which=slice(None)):
         for piece in self.pieces[which]:
             self.file.write_bytes(piece)
@@ -107,8 +117,7 @@ def test_bytes_hold_the_rows_of_the_track(fed):
     t = np.arange(1, 31) * 0.25
     block = np.stack((40 + np.cos(t), np.where(np.arange(30) % 3, np.sin(t), np.nan)), axis=1)
     batch = Events.concat([readings(t, 40 + np.sin(t)), truths(t, block)], fed.engine.model.width)
-    fed.put(batch.select(np.argsort(batch.t, kind="stable")))
-    fed.next()
+    fed.show(batch.select(np.argsort(batch.t, kind="stable")))
     pull = fed.track()
     rows = last_of_each_time(pull.events.t)
     for j, name in enumerate(fed.engine.model.state_names):
@@ -170,11 +179,9 @@ def test_the_numbers_stand_inside_the_picture_and_at_the_mean_where_they_fit(wid
 
 
 def test_nothing_new_is_no_message_and_new_rows_are_sent_once(fed):
-    fed.put(readings([1.0, 2.0], [40.0, 41.0]))
-    fed.next()
+    fed.show(readings([1.0, 2.0], [40.0, 41.0]))
     assert fed.next() == []
-    fed.put(readings([3.0], [42.0]))
-    fed.next()
+    fed.show(readings([3.0], [42.0]))
     assert fed.next() == []
     assert fed.column("/state/temperature")[0].tolist() == [1_000_000_000, 2_000_000_000, 3_000_000_000]
     # One count a message, by which the page sees how far the viewer has got.
@@ -187,12 +194,10 @@ def test_nothing_new_is_no_message_and_new_rows_are_sent_once(fed):
 
 def test_a_new_revision_is_another_recording_with_the_old_one_in_grey(fed):
     t = np.arange(1, 21) * 0.5
-    fed.put(readings(t, 40 + t))
-    fed.next()
+    fed.show(readings(t, 40 + t))
     _, old = fed.column("/state/temperature")
     _, old_nis = fed.column("/nis/window")
-    fed.submit(commands.SetTuning("Q.temperature", 5.0))
-    fed.next()
+    fed.retune()
     assert [said["revision"] for said in fed.said] == [0, 1]
     assert fed.said[0]["recording"] != fed.said[1]["recording"]
     _, new = fed.column("/state/temperature")
@@ -204,10 +209,8 @@ def test_a_new_revision_is_another_recording_with_the_old_one_in_grey(fed):
 
 def test_the_window_of_a_revision_comes_before_its_past(fed):
     t = np.arange(1, 401) * 0.1
-    fed.put(readings(t, 40 + np.sin(t)))
-    fed.next()
-    fed.submit(commands.SetTuning("Q.temperature", 5.0))
-    fed.next()
+    fed.show(readings(t, 40 + np.sin(t)))
+    fed.retune()
     times, _ = fed.column("/state/temperature")
     assert times[0] >= (t[-1] - FIRST_WINDOWS * WINDOW) * 1e9 and times[-1] == round(t[-1] * 1e9)
     assert len(fed.pieces) == 1
@@ -223,8 +226,7 @@ def test_events_outlive_the_recording_and_say_of_which_revision_they_are(fed):
     fed.put(readings([1.0, 2.0], [40.0, 41.0]))
     fed.engine.notices.say("something happened")
     fed.next()
-    fed.submit(commands.SetTuning("Q.temperature", 5.0))
-    fed.next()
+    fed.retune()
     fed.engine.notices.say("something else happened")
     fed.next()
     texts = fed.column("/events", "TextLog:text")[1].ravel().tolist()
@@ -235,22 +237,17 @@ def test_the_layout_comes_once(fed):
     def stores(piece):
         return piece.count(b"Blueprint") + piece.count(b"blueprint")
 
-    fed.put(readings([1.0, 2.0], [40.0, 41.0]))
-    fed.next()
+    fed.show(readings([1.0, 2.0], [40.0, 41.0]))
     assert stores(fed.pieces[0]) > 0
-    fed.submit(commands.SetTuning("Q.temperature", 5.0))
-    fed.next()
+    fed.retune()
     # Else the zoom and the play state that the user chose would be lost.
     assert stores(fed.pieces[0]) == 0
 
 
 def test_late_readings_are_drawn_once_and_lines_do_not_go_back(fed):
-    fed.put(readings([1.0, 2.0, 3.0], [40.0, 41.0, 42.0]))
-    fed.next()
-    fed.put(readings([2.5], [41.5]))
-    fed.next()
-    fed.put(readings([4.0], [43.0]))
-    fed.next()
+    fed.show(readings([1.0, 2.0, 3.0], [40.0, 41.0, 42.0]))
+    fed.show(readings([2.5], [41.5]))
+    fed.show(readings([4.0], [43.0]))
     sensor = fed.engine.model.row_names[0]
     times, values = fed.column(f"/reading/{sensor}")
     assert (times * 1e-9).tolist() == [1.0, 2.0, 2.5, 3.0, 4.0]
@@ -260,8 +257,7 @@ def test_late_readings_are_drawn_once_and_lines_do_not_go_back(fed):
 
 def test_a_reset_at_the_time_of_the_last_reading_is_seen_in_the_picture(fed):
     """As after the end of a source: no event follows that would bring the next picture."""
-    fed.put(readings(np.arange(1.0, 21.0), np.full(20, 40.0)))
-    fed.next()
+    fed.show(readings(np.arange(1.0, 21.0), np.full(20, 40.0)))
     fed.submit(commands.Reset())
     assert fed.events() == 21
     fed.next()
@@ -277,8 +273,7 @@ def test_a_withheld_estimate_is_neither_drawn_in_lines_nor_in_pictures(tmp_path)
     first, second = MODEL.states
     fed = Fed(tmp_path, model=replace(MODEL, states=(first, replace(second, withhold=limit))))
     t = np.arange(1.0, 21.0)
-    fed.put(readings(t, 40.0 + 0.1 * t))
-    fed.next()
+    fed.show(readings(t, 40.0 + 0.1 * t))
     track = fed.track().track
     shown = HALF_WIDTH * track.std[:, 1] <= limit
     assert 0 < shown.sum() < t.size
@@ -292,8 +287,7 @@ def test_a_withheld_estimate_is_neither_drawn_in_lines_nor_in_pictures(tmp_path)
 
 def test_dates_are_dates_and_seconds_are_durations(fed):
     batch = readings(np.array([1.0, 2.0]) + FIRST_DATED_NS * 1e-9, [40.0, 41.0])
-    fed.put(batch)
-    fed.next()
+    fed.show(batch)
     kinds = {
         batch.schema.field("time").type
         for batch in (
@@ -334,8 +328,7 @@ def test_a_long_history_is_drawn_by_its_extremes(fed):
     t = np.arange(1, 30_001) * 0.01
     value = 40 + rng.normal(size=t.size)
     value[12_345] = 500.0
-    fed.put(readings(t, value))
-    fed.next()
+    fed.show(readings(t, value))
     times, values = fed.column(f"/reading/{fed.engine.model.row_names[0]}")
     assert values.max() == 500.0
     assert times.size <= 2 * (feed.HISTORY_STRETCHES + 2)
@@ -432,21 +425,18 @@ def test_after_seeking_back_nothing_lies_beyond_the_rows(fed):
     assert newest_of(fed) == 5 * 10**9
     # Nor later: it was said of another pass over the recording.
     fed.engine.notices.say("said at 5 s")
-    fed.put(readings(np.arange(6.0, 51.0), np.full(45, 40.0)))
-    fed.next()
+    fed.show(readings(np.arange(6.0, 51.0), np.full(45, 40.0)))
     assert newest_of(fed) == 50 * 10**9
     assert fed.lines() == [(5 * 10**9, "said at 5 s")]
 
 
 def test_a_revision_without_rows_does_not_empty_the_pane(fed):
-    fed.put(readings([1.0, 2.0], [40.0, 41.0]))
-    fed.next()
+    fed.show(readings([1.0, 2.0], [40.0, 41.0]))
     seek_back(fed, Events.empty(fed.engine.model.width))
     assert fed.next() == [] and fed.next() == []
     fed.engine.notices.say("still said")
     assert fed.next() == []
-    fed.put(readings([1.0], [40.0]))
-    fed.next()
+    fed.show(readings([1.0], [40.0]))
     assert [said["revision"] for said in fed.said] == [0, 1]
     assert fed.column("/state/temperature")[0].tolist() == [10**9]
     assert [text for _, text in fed.lines()] == ["still said"]
@@ -457,16 +447,14 @@ def test_a_line_that_comes_before_its_row_waits_for_it(fed):
     fed.engine.notices.say("ahead", t=3 * 10**9)
     fed.next()
     assert newest_of(fed) == 2 * 10**9
-    fed.put(readings([3.0], [40.0]))
-    fed.next()
+    fed.show(readings([3.0], [40.0]))
     assert [text for _, text in fed.lines()] == ["ahead"]
 
 
 def test_a_line_is_not_lost_while_there_are_no_rows(fed):
     fed.engine.notices.say("the bus is silent")
     fed.next()
-    fed.put(readings([1.0], [40.0]))
-    fed.next()
+    fed.show(readings([1.0], [40.0]))
     assert [text for _, text in fed.lines()] == ["the bus is silent"]
 
 

@@ -73,7 +73,7 @@ def test_a_row_is_inputs_then_readings_then_truths(tmp_path):
         (200_000_000, READING, 1, NAN, NAN),
         (200_000_000, TRUTH, 2, 8.0, NAN),
     ]
-    np.testing.assert_array_equal(np.array(events(got)), np.array(expected))
+    np.testing.assert_array_equal(events(got), expected)
     assert reports.counts == {"condition pair": 1}
 
 
@@ -96,7 +96,7 @@ def test_true_states_of_a_row_are_blocks(tmp_path):
         (3 * 10**9, TRUTH, 5, 6.0, NAN),
         (5 * 10**9, TRUTH, 1, 2.0, 3.0),
     ]
-    np.testing.assert_array_equal(np.array(got), np.array(expected))
+    np.testing.assert_array_equal(got, expected)
 
 
 def test_blank_says_nothing_and_what_is_no_number_is_missing_with_its_line(tmp_path):
@@ -111,7 +111,7 @@ def test_blank_says_nothing_and_what_is_no_number_is_missing_with_its_line(tmp_p
         (2 * 10**9, READING, 0, NAN, NAN),
         (2 * 10**9, READING, 1, NAN, 1.0),
     ]
-    np.testing.assert_array_equal(np.array(events(got)), np.array(expected))
+    np.testing.assert_array_equal(events(got), expected)
     assert reports.counts == {"unreadable value": 2, "never seen": 3}  # temp, power and x have no number
     assert reports.texts["unreadable value"] == "drive.csv:4: x is 'oops', which is not a number; the value is missing"
 
@@ -253,7 +253,7 @@ def test_only_picks_the_rows_that_speak_of_a_sensor(tmp_path):
         (2 * 10**9, READING, 0, NAN, NAN),
         (5 * 10**9, READING, 1, NAN, NAN),
     ]
-    np.testing.assert_array_equal(np.array(events(got)), np.array(expected))
+    np.testing.assert_array_equal(events(got), expected)
     assert reports.counts == {"condition r0": 1, "row of no sensor": 1}
     assert reports.texts["row of no sensor"] == (
         "ranges.csv:6: anchor has no value, so the row is of no sensor and is left out; give it its anchor"
