@@ -9,7 +9,7 @@ from estimators.errors import NisusError
 from estimators.log import MARK, READING
 from sources.faults.kinds import KINDS
 from sources.faults.layer import Faults, FaultySource
-from tests.app.scripted import MODEL, pull_all, readings
+from tests.app.scripted import MODEL, notice_texts, pull_all, readings
 from tests.app.web.test_bounds import NASTY
 from tests.cases import cases
 from tests.support import SECOND
@@ -18,7 +18,11 @@ from tests.waiting import wait_for
 
 @pytest.fixture
 def page(serve):
-    return serve(behind=lambda source: FaultySource(source, Faults(MODEL)))
+    """Of a source that takes faults, after one measurement."""
+    page = serve(behind=lambda source: FaultySource(source, Faults(MODEL)))
+    page.source.put(readings([1.0], [40.0]))
+    wait_for(lambda: page.rows() == 1)
+    return page
 
 
 def ask(page, **body):
@@ -26,12 +30,10 @@ def ask(page, **body):
 
 
 def active(page):
-    return json.loads(page.client.get("/api/status").text)["faults"]
+    return page.get("/api/status")["faults"]
 
 
 def test_a_fault_begins_and_ends_by_command(page):
-    page.source.put(readings([1.0], [40.0]))
-    wait_for(lambda: page.rows() == 1)
     assert active(page) == []
     assert ask(page, command="InjectFault", kind="bias", target="winding", size=2.5).status == 202
     wait_for(lambda: len(active(page)) == 1)
@@ -54,24 +56,22 @@ def test_a_fault_begins_and_ends_by_command(page):
         (1.0, 40.0), (2.0, 42.5), (2.0, code), (3.0, 43.5), (4.0, 42.0), (4.0, -code),
     ]  # fmt: skip
     assert events.kind.tolist() == [READING, READING, MARK, READING, READING, MARK]
-    said = [notice.text for notice in page.engine.notices.since(0)]
+    said = notice_texts(page.engine)
     assert "fault 0 begins: bias of winding, size 2.5 °C" in said and "1 fault(s) end" in said
 
 
 def test_all_end_together_and_what_is_swallowed_is_counted(page):
-    page.source.put(readings([1.0], [40.0]))
-    wait_for(lambda: page.rows() == 1)
     assert ask(page, command="InjectFault", kind="silence").status == 202
     assert ask(page, command="InjectFault", kind="stuck", target="winding", duration=60).status == 202
     wait_for(lambda: len(active(page)) == 2)
     page.source.put(readings([2.0, 3.0], [40.0, 41.0]))
-    wait_for(lambda: json.loads(page.client.get("/api/status").text)["counts"].get("silenced") == 2)
+    wait_for(lambda: page.get("/api/status")["counts"].get("silenced") == 2)
     assert ask(page, command="ClearFault").status == 202
     wait_for(lambda: active(page) == [])
 
 
 def test_the_catalogue_says_what_a_kind_takes(page):
-    found = json.loads(page.client.get("/api/faults").text)
+    found = page.get("/api/faults")
     assert found["available"] and found["sensors"] == {"winding": [{"name": "winding", "unit": "°C"}]}
     kinds = {kind["name"]: kind for kind in found["kinds"]}
     # The scripted source is no asset whose parameters could change.
@@ -95,8 +95,6 @@ def test_ending_a_fault_that_there_is_not_is_one_line(page):
 
 
 def test_nothing_that_is_asked_for_stops_the_source(page):
-    page.source.put(readings([1.0], [40.0]))
-    wait_for(lambda: page.rows() == 1)
     taken = 0
     for kind in [*KINDS, "outliers"]:
         for target in (None, "winding"):
@@ -121,7 +119,7 @@ def test_nothing_that_is_asked_for_stops_the_source(page):
 
     # Those before it may come late: the faults of their time delay, repeat and withhold.
     wait_for(lambda: taken_at(4.0) == [42.0])
-    counts = json.loads(page.client.get("/api/status").text)["counts"]
+    counts = page.get("/api/status")["counts"]
     assert not counts.get("engine error") and not counts.get("source failed")
 
 

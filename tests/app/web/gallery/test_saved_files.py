@@ -1,6 +1,7 @@
 """A twin's file saved in an editor: folded again, refused with its line, or started anew."""
 
 import os
+from contextlib import contextmanager
 from unittest.mock import Mock
 
 import numpy as np
@@ -48,6 +49,14 @@ def save(path, text):
     other.replace(path)
 
 
+@contextmanager
+def ended(pump):
+    """The session of a twin whose source has ended, and its engine."""
+    with opened(pump.parent / "r", pump, speed=1e6) as session:
+        wait_for(lambda: session.engine.status().finished)
+        yield session, session.engine
+
+
 def folded(session):
     wait_for(lambda: not session.engine.status().refolding)
 
@@ -70,9 +79,7 @@ def mean(path, events):
 
 
 def test_a_saved_tuning_is_a_revision_over_the_same_readings(pump):
-    with opened(pump.parent / "r", pump, speed=1e6) as session:
-        engine = session.engine
-        wait_for(lambda: engine.status().finished)
+    with ended(pump) as (session, engine):
         # What is turned on the page stays, unless the file says otherwise.
         engine.submit(SetTuning("R.winding", 9.0))
         wait_for(lambda: engine.status().revision == 1)
@@ -129,9 +136,7 @@ def test_a_saved_model_is_folded_and_its_mistake_has_a_line(pump):
     model = pump.with_name("pump.py")
     save(model, MODEL)
     save(pump, YAML.replace("motor_winding", "./pump.py:Pump"))
-    with opened(pump.parent / "r", pump, speed=1e6) as session:
-        engine = session.engine
-        wait_for(lambda: engine.status().finished)
+    with ended(pump) as (session, engine):
         began = pull_all(engine)
         save(model, MODEL.replace("1.0", "1.0 / 0"))
         wait_for(lambda: told(session)["unread"] is not None)
@@ -166,9 +171,7 @@ Pump = replace(Pump, f=f, F=None, linear=False)
 """
     save(pump.with_name("pump.py"), IMPORTING + damped)
     save(pump, YAML.replace("motor_winding", "./pump.py:Pump").replace("kf", "ekf"))
-    with opened(pump.parent / "r", pump, speed=1e6) as session:
-        engine = session.engine
-        wait_for(lambda: engine.status().finished)
+    with ended(pump) as (session, engine):
         began = pull_all(engine)
         save(helper, "FACTOR = 1.0\nDAMPING = 1.0 +\n")
         wait_for(lambda: told(session)["unread"] is not None)
@@ -209,17 +212,14 @@ def test_what_a_file_imports_beside_it_is_found_however_it_is_written(tmp_path):
 
 
 def test_a_recording_has_the_twin_as_it_was_saved_last(pump):
-    recordings = pump.parent / "r"
-    with opened(recordings, pump, speed=1e6) as session:
-        engine = session.engine
-        wait_for(lambda: engine.status().finished)
+    with ended(pump) as (session, engine):
         session.post("/api/command", {"command": "Record", "path": "run.rrd"})
         wait_for(lambda: engine.status().recording is not None)
         save(pump, YAML.replace("0.01", "0.5"))
         wait_for(lambda: engine.status().revision == 1)
         session.post("/api/command", {"command": "Record", "path": None})
         wait_for(lambda: session.session.recorder.finished)
-    recorded = read_recording(recordings / "run.rrd")
+    recorded = read_recording(pump.parent / "r" / "run.rrd")
     assert recorded.text == pump.read_text() and recorded.tunings == 2
 
 
