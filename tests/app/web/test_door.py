@@ -226,8 +226,8 @@ def test_nothing_else_of_the_disk_is_served(page, target):
 
 def test_the_reviewed_recording_is_served(page):
     assert page.client.get("/rec/reviewed.rrd").body == b"RRF2 and so on"
-    assert "reviewed.rrd" in json.loads(page.client.get("/api/status").text)["recordings"]
-    assert json.loads(page.client.get("/api/recordings").text) == [{"name": "reviewed.rrd", "bytes": 14}]
+    assert "reviewed.rrd" in page.get("/api/status")["recordings"]
+    assert page.get("/api/recordings") == [{"name": "reviewed.rrd", "bytes": 14}]
 
 
 def test_every_answer_forbids_to_leave_the_machine(page):
@@ -257,11 +257,11 @@ def test_a_command_is_noted_with_the_revision_that_its_user_saw(serve, monkeypat
 
 
 def test_the_scene_is_chosen_and_the_status_tells_it(fresh):
-    offered = json.loads(fresh.client.get("/api/scene").text)
+    offered = fresh.get("/api/scene")
     assert offered == [{"key": "x", "label": "x", "options": ["temperature", "rate"], "value": "temperature"}]
     assert json.loads(fresh.client.post("/api/scene", {"key": "x", "value": "rate"}).text)[0]["value"] == "rate"
     assert fresh.choices.values() == {"x": "rate"}
-    assert json.loads(fresh.client.get("/api/status").text)["scene"][0]["value"] == "rate"
+    assert fresh.get("/api/status")["scene"][0]["value"] == "rate"
     for body in ({"key": "x", "value": "mass"}, {"key": "w", "value": "rate"}, {}, [], 7):
         answer = fresh.client.post("/api/scene", body)
         assert answer.status == 400 and answer.text.count("\n") == 0 and json.loads(answer.text)["error"]
