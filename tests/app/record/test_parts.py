@@ -63,6 +63,12 @@ def start(monkeypatch):
         engine.recorder.stop()
 
 
+@pytest.fixture
+def path(tmp_path):
+    """Where a recording may be."""
+    return tmp_path / "run.rrd"
+
+
 def end_of(engine):
     pull = pull_all(engine)
     return pull.first + len(pull.events)
@@ -82,6 +88,12 @@ def feed(source, engine, start, stop, step=200, late=()):
                 source.put(readings(TIMES[part], VALUES[part]))
         wait_for(lambda stop=piece[-1] + 1: end_of(engine) == stop)
         wait_for(lambda stop=piece[-1] + 1: engine.recorder.path is None or recorded_to(engine) >= stop)
+
+
+def record(engine, path):
+    """Begin a recording, and wait for that."""
+    engine.submit(commands.Record(path))
+    wait_for(lambda: engine.recorder.path == path)
 
 
 def edit(engine, key, value):
@@ -154,9 +166,8 @@ def written(path, entity="/nisus/events"):
     return sum(chunk.num_rows for chunk in reader.stream() if chunk.entity_path == entity)
 
 
-def test_edits_add_their_tunings_and_one_drawing_of_the_history(start, tmp_path):
+def test_edits_add_their_tunings_and_one_drawing_of_the_history(start, path):
     source, engine, drawn = start()
-    path = tmp_path / "run.rrd"
     engine.submit(commands.Record(path))
     feed(source, engine, 0, 2000)
     wait_for(lambda: sum(len(pull.events) for pull in drawn) == 2000)
@@ -182,8 +193,7 @@ def test_parts_fold_by_themselves_to_the_same_bits(estimator, start, tmp_path):
     """Also where a late reading belongs before the part begins, and after an edit within the last one."""
     source, engine, _ = start(estimator, split=Split(size=50_000))
     path = tmp_path / "run.rrd"
-    engine.submit(commands.Record(path))
-    wait_for(lambda: engine.recorder.path == path)
+    record(engine, path)
     feed(source, engine, 0, 5400, late=range(150, 5400, 200))
     first = pull_all(engine)
     edit(engine, "Q.rate", 0.013)
@@ -230,7 +240,7 @@ def test_every_part_has_the_notes_of_users_so_far(start, tmp_path):
     assert written(engine.recorder.finished[0], "/nisus/annotations") == 1
 
 
-def test_an_edit_while_a_part_is_begun_reviews_to_the_same_bits(start, tmp_path):
+def test_an_edit_while_a_part_is_begun_reviews_to_the_same_bits(start, path):
     """Where the part starts was copied from the revision before, which is gone when its rows are written."""
     source, engine, drawn = start(split=Split(size=50_000))
 
@@ -240,9 +250,7 @@ def test_an_edit_while_a_part_is_begun_reviews_to_the_same_bits(start, tmp_path)
         return drawn.append
 
     engine.recorder._draw = draw
-    path = tmp_path / "run.rrd"
-    engine.submit(commands.Record(path))
-    wait_for(lambda: engine.recorder.path == path)
+    record(engine, path)
     feed(source, engine, 0, COUNT)
     last = pull_all(engine)
     stop_recording(engine)
@@ -281,14 +289,12 @@ def test_an_edit_between_a_pull_and_its_tuning_is_written_once(tmp_path, monkeyp
 
 
 @pytest.mark.parametrize("estimator", ["kf", "pf"])
-def test_a_session_that_forgot_its_oldest_events_reviews_to_the_same_bits(estimator, start, tmp_path):
+def test_a_session_that_forgot_its_oldest_events_reviews_to_the_same_bits(estimator, start, path):
     """The history is folded again from what the forgotten events left, and random numbers go by a row's own index."""
     source, engine, _ = start(estimator, history=2048)
-    path = tmp_path / "run.rrd"
     feed(source, engine, 0, 5400, step=100)
     assert pull_all(engine).first > 0
-    engine.submit(commands.Record(path))
-    wait_for(lambda: engine.recorder.path == path)
+    record(engine, path)
     feed(source, engine, 5400, 5600)
     stop_recording(engine)
     seen = pull_all(engine)
@@ -301,9 +307,8 @@ def test_a_session_that_forgot_its_oldest_events_reviews_to_the_same_bits(estima
 
 
 @pytest.mark.parametrize("estimator", ["kf", "pf"])
-def test_an_edit_after_events_were_forgotten_reviews_to_the_same_bits(estimator, start, tmp_path):
+def test_an_edit_after_events_were_forgotten_reviews_to_the_same_bits(estimator, start, path):
     source, engine, _ = start(estimator, history=2048)
-    path = tmp_path / "run.rrd"
     engine.submit(commands.Record(path))
     feed(source, engine, 0, 5600, step=100)
     assert pull_all(engine).first > 0
@@ -334,11 +339,10 @@ def test_a_taken_path_is_refused_by_command_line_and_running_twin(start, tmp_pat
 Usage = namedtuple("Usage", "total used free")
 
 
-def test_a_disk_that_fills_is_warned_of_and_the_recording_closed_in_time(start, tmp_path, monkeypatch):
+def test_a_disk_that_fills_is_warned_of_and_the_recording_closed_in_time(start, path, monkeypatch):
     free = 10**12
     monkeypatch.setattr(shutil, "disk_usage", lambda path: Usage(2 * 10**12, 0, free))
     source, engine, _ = start()
-    path = tmp_path / "run.rrd"
 
     def warnings():
         return [line.text for line in engine.notices.since(0) if line.level != "info" and "winding" not in line.text]
@@ -466,8 +470,7 @@ def test_memory_does_not_grow_with_what_was_written(tmp_path):
 
 
 @pytest.mark.skipif(not hasattr(signal, "SIGHUP"), reason="no SIGHUP here")
-def test_a_terminal_that_closes_leaves_a_whole_recording(tmp_path):
-    path = tmp_path / "run.rrd"
+def test_a_terminal_that_closes_leaves_a_whole_recording(path):
     words = ["run", "motor_winding", "--headless", "--record", str(path)]
     # Under `nohup` a process and its children ignore SIGHUP.
     reset = partial(signal.signal, signal.SIGHUP, signal.SIG_DFL)
