@@ -228,21 +228,6 @@ def seekable(serve, tmp_path, monkeypatch):
     page.engine.recorder = None
 
 
-@pytest.mark.parametrize(
-    "path, says",
-    [
-        ("x" * 300 + ".rrd", "255"),
-        ("é" * 130 + ".rrd", "255"),
-        ("\ud800.rrd", "path"),
-        ("a\0b.rrd", "path"),
-        ("a\nb.rrd", "path"),
-    ],
-)
-def test_a_name_that_no_file_can_have_is_refused(seekable, path, says):
-    answer = seekable.client.post("/api/command", {"command": "Record", "path": path})
-    assert answer.status == 400 and says in said(answer)
-
-
 def test_no_command_is_answered_by_a_failure_of_ours(seekable):
     draw = random.Random(9)
     asked = [{"command": value} for value in NASTY] + [value for value in NASTY]
@@ -267,13 +252,7 @@ def test_no_command_is_answered_by_a_failure_of_ours(seekable):
     before = seekable.rows()
     seekable.source.put(readings([3.0], [41.0]))
     wait_for(lambda: seekable.rows() == before + 1)
-    assert json.loads(seekable.client.get("/api/status").text)["counts"].get("engine error", 0) == 0
-
-
-@pytest.mark.parametrize("value", ["inf", "-inf", 1e300, 0.5])
-def test_a_value_outside_its_range_is_refused_by_name(seekable, value):
-    answer = seekable.client.post("/api/command", {"command": "SetTuning", "key": "Q.temperature", "value": value})
-    assert (answer.status == 202) == (value == 0.5), answer.text
+    assert seekable.get("/api/status")["counts"].get("engine error", 0) == 0
 
 
 def test_no_address_is_answered_by_a_failure_of_ours(page):
