@@ -1,6 +1,7 @@
 """One measurement from any live source: the same state from every output, equal to the row of the fold."""
 
 import json
+import socket
 import struct
 import uuid
 from datetime import UTC, datetime, timedelta
@@ -21,14 +22,17 @@ from estimators.errors import ConfigError, NisusError
 from estimators.log import READING, Log
 from sources.source import ignore
 from tests import ROOT
-from tests.app.engine.outputs.pushed import BEGIN, push, pushed_twin
+from tests.app.engine.outputs.pushed import BEGIN, publishing, push, pushed_twin
 from tests.app.engine.outputs.test_alerts import state
 from tests.app.scripted import notice_texts, pull_all
 from tests.cases import cases
 from tests.extensions.modbus.device import Device
-from tests.extensions.mqtt.broker import Broker, Listener
+from tests.extensions.mqtt.broker import Listener
+from tests.extensions.mqtt.conftest import broker, listener
 from tests.support import SECOND, error_of, free_port
 from tests.waiting import wait_for
+
+__all__ = ["broker", "listener"]
 
 VALUES = (40.25, 41.5, 42.125, 41.75)
 """Exact in float32, so that a frame of the bus carries them."""
@@ -147,19 +151,22 @@ class Subscriber:
         self.client.disconnect()
 
 
+@pytest.fixture
+def plant(tmp_path, broker):
+    made = Plant(tmp_path, broker)
+    yield made
+    made.close()
+
+
 @pytest.mark.parametrize("kind", ["push", "mqtt", "opcua", "modbus", "can"])
-def test_the_same_state_from_every_output_whatever_the_source(serve, tmp_path, kind):
-    broker = Broker(tmp_path)
-    plant, port, dbc = Plant(tmp_path, broker), free_port(), tmp_path / "estimate.dbc"
+def test_the_same_state_from_every_output_whatever_the_source(plant, broker, listener, serve, tmp_path, kind):
+    port, dbc = free_port(), tmp_path / "estimate.dbc"
     bus = {"interface": "virtual", "channel": plant.channel, "id": 1536, "dbc": str(dbc)}
     outputs = {"every": 0, "mqtt": {"host": "127.0.0.1", "port": broker.port}, "opcua": {"port": port}, "can": bus}
     twin = pushed_twin(outputs, json.dumps(plant.source(kind)))
-    page = serve(twin=twin, behind=lambda _: twin.open_source(ignore))
-    publisher = page.engine.published = Publisher(page.engine)
-    publisher.start()
-    hears, monitor = Listener(broker), can.Bus(interface="virtual", channel=plant.channel)
-    try:
-        wait_for(lambda: all(item["connected"] for item in publisher.json()["outputs"]))
+    monitored = can.Bus(interface="virtual", channel=plant.channel)
+    with publishing(serve, twin) as page, monitored as monitor:
+        wait_for(lambda: all(item["connected"] for item in page.engine.published.json()["outputs"]))
         plant.send(kind, page)
         wait_for(lambda: len(finite_rows(page)[1]) >= len(VALUES))
         rows, read = finite_rows(page)
@@ -175,8 +182,8 @@ def test_the_same_state_from_every_output_whatever_the_source(serve, tmp_path, k
 
         # HTTP and MQTT
         names = [item.name for item in twin.model.shown_states]
-        wait_for(lambda: [m for m in hears.of("nisus/motor_winding/state") if m["time_ns"] == t])
-        for found in (page.get("/api/state"), hears.of("nisus/motor_winding/state")[-1]):
+        wait_for(lambda: [m for m in listener.of("nisus/motor_winding/state") if m["time_ns"] == t])
+        for found in (page.get("/api/state"), listener.of("nisus/motor_winding/state")[-1]):
             assert found["time_ns"] == t
             assert [item["value"] for item in found["states"]] == mean
             assert [item["std"] for item in found["states"]] == std
@@ -209,13 +216,6 @@ def test_the_same_state_from_every_output_whatever_the_source(serve, tmp_path, k
 
         wait_for(received)
         assert {str(signals[f"{name}_mean_grade"]) for name in names} == {state["grade"] for state in found["states"]}
-    finally:
-        publisher.stop()
-        hears.stop()
-        monitor.shutdown()
-        page.stop()
-        plant.close()
-        broker.stop()
 
 
 @cases(__file__, "status_codes.csv")
@@ -262,18 +262,13 @@ def test_an_output_that_cannot_be_is_refused_in_one_line(serve, tmp_path, output
 
 
 def test_a_port_in_use_is_reported_and_delays_nothing(serve, tmp_path):
-    import socket
-
     with socket.create_server(("127.0.0.1", 0)) as taken:
         twin = pushed_twin({"opcua": {"port": taken.getsockname()[1]}})
-        page = serve(twin=twin, behind=lambda _: twin.open_source(ignore))
-        publisher = Publisher(page.engine)
-        publisher.start()
-        Plant(tmp_path, None).post(page)
-        wait_for(lambda: any("is not served" in text for text in notice_texts(page.engine)))
-        assert not publisher.json()["outputs"][0]["connected"]
-        wait_for(lambda: page.rows() == len(VALUES))
-        publisher.stop()
+        with publishing(serve, twin) as page:
+            Plant(tmp_path, None).post(page)
+            wait_for(lambda: any("is not served" in text for text in notice_texts(page.engine)))
+            assert not page.engine.published.json()["outputs"][0]["connected"]
+            wait_for(lambda: page.rows() == len(VALUES))
 
 
 @cases(__file__, "refused_sources.csv")

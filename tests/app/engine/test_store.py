@@ -64,6 +64,12 @@ class Session:
         return notice_texts(self.engine)
 
 
+@pytest.fixture
+def path(tmp_path):
+    """Where a store may be."""
+    return tmp_path / "a.store"
+
+
 def walk(n, begin=0, seed=1):
     """The measurements from `begin` to `n` of a random walk."""
     times, values = random_walk(n, seed)
@@ -101,8 +107,7 @@ def test_a_store_continues_bit_for_bit(tmp_path):
         np.testing.assert_array_equal(getattr(resumed.track, name), getattr(whole.track, name))
 
 
-def test_edits_runs_and_notes_are_continued(tmp_path):
-    path = tmp_path / "a.store"
+def test_edits_runs_and_notes_are_continued(path):
     before = Session(path).put(walk(500))
     before.submit(SetTuning("Q.temperature", 0.5), SetEstimator("ukf"), Note(1, "wide"), Annotate("pump on", T0 + 20.0))
     before.running.stop()
@@ -156,42 +161,43 @@ def damaged(path):
     path.write_bytes(data)
 
 
-def without_some_events(path):
-    with closing(sqlite3.connect(path, isolation_level=None)) as file:
-        file.execute("DELETE FROM parts WHERE kind = 'events' AND at = (SELECT max(at) FROM parts)")
+def rewritten(sql, *given):
+    """What spoils a store by this command of SQLite."""
 
+    def spoil(path):
+        with closing(sqlite3.connect(path, isolation_level=None)) as file:
+            file.execute(sql, given)
 
-def of_another_version(path):
-    with closing(sqlite3.connect(path, isolation_level=None)) as file:
-        file.execute(f"PRAGMA user_version={FORMAT + 1}")
+    return spoil
 
 
 def of_another_program(path):
     path.unlink()
-    with closing(sqlite3.connect(path, isolation_level=None)) as file:
-        file.execute("CREATE TABLE songs (name TEXT)")
+    rewritten("CREATE TABLE songs (name TEXT)")(path)
 
 
-def with_numbers_that_are_none(path):
-    with closing(sqlite3.connect(path, isolation_level=None)) as file:
-        data = b'{"plc": [[1, "x"]]}'
-        file.execute("UPDATE parts SET data = ?, crc = ? WHERE kind = 'numbers'", (data, zlib.crc32(data)))
+WRONG = b'{"plc": [[1, "x"]]}'
+NUMBERS = "UPDATE parts SET data = ?, crc = ? WHERE kind = 'numbers'"
+ANOTHER = rewritten(f"PRAGMA user_version={FORMAT + 1}"), f"has format {FORMAT + 1}, this version reads {FORMAT}; rem"
+"""A store of another version, and what is said of it."""
 
 
 @pytest.mark.parametrize(
     ("spoil", "reason"),
     [
-        (with_numbers_that_are_none, "cannot be continued (ValueError: invalid literal"),
+        (rewritten(NUMBERS, WRONG, zlib.crc32(WRONG)), "cannot be continued (ValueError: invalid literal"),
         (damaged, "is damaged; remove it, or choose another path"),
-        (without_some_events, "events are missing; it is damaged; remove it, or choose another path"),
-        (of_another_version, f"has format {FORMAT + 1}, this version reads {FORMAT}; remove it"),
+        (
+            rewritten("DELETE FROM parts WHERE kind = 'events' AND at = (SELECT max(at) FROM parts)"),
+            "events are missing; it is damaged; remove it, or choose another path",
+        ),
+        ANOTHER,
         (of_another_program, "is no store of Nisus; choose another path"),
         (lambda path: path.write_text("a: text\n" * 1000), "is no store of Nisus; choose another path"),
         (lambda path: (path.unlink(), path.mkdir()), "cannot be opened; choose a path in a folder that can be written"),
     ],
 )
-def test_a_store_that_cannot_be_used_is_one_line_and_stays_as_it_is(tmp_path, capsys, spoil, reason):
-    path = tmp_path / "a.store"
+def test_a_store_that_cannot_be_used_is_one_line_and_stays_as_it_is(path, capsys, spoil, reason):
     Session(path).put(walk(3000)).running.stop()
     spoil(path)
     before = None if path.is_dir() else path.read_bytes()[HEADER:]
@@ -204,8 +210,7 @@ def test_a_store_that_cannot_be_used_is_one_line_and_stays_as_it_is(tmp_path, ca
     assert before is None or path.read_bytes()[HEADER:] == before
 
 
-def test_a_store_of_another_twin_or_in_use_is_left_alone(tmp_path, capsys):
-    path = tmp_path / "a.store"
+def test_a_store_of_another_twin_or_in_use_is_left_alone(path, capsys):
     first = Session(path).put(walk(100)).write()
     second = Session(path).put(walk(20))
     assert f"store {path}: another process uses it; stop that" in capsys.readouterr().err
@@ -233,9 +238,8 @@ def send(session, *numbers):
     return status, asyncio.run(stored(session.engine, source.accepted))
 
 
-def test_what_is_acknowledged_survives_a_kill_and_is_taken_once(tmp_path, monkeypatch):
+def test_what_is_acknowledged_survives_a_kill_and_is_taken_once(path, monkeypatch):
     monkeypatch.setattr("app.web.readings.STORE_TIMEOUT_S", 60.0)  # for a machine that is busy with other tests
-    path = tmp_path / "a.store"
     twin, source = pushed()
     before = Session(path, source, twin)
     before.running.start()
@@ -264,8 +268,7 @@ def test_without_a_store_nothing_is_acknowledged_as_stored():
     assert send(Session(None, source, twin), 1) == (["accepted"], False)
 
 
-def test_an_unexpected_failure_is_one_line_and_everything_is_written_later(tmp_path, monkeypatch):
-    path = tmp_path / "a.store"
+def test_an_unexpected_failure_is_one_line_and_everything_is_written_later(path, monkeypatch):
     session = Session(path).put(walk(100)).write()
     with monkeypatch.context() as patch:
         patch.setattr("app.engine.store._events_to_bytes", lambda events: 1 / 0)
@@ -278,8 +281,7 @@ def test_an_unexpected_failure_is_one_line_and_everything_is_written_later(tmp_p
     assert pull_all(Session(path).engine).events.t.size == 300
 
 
-def test_a_file_that_is_removed_is_begun_again(tmp_path):
-    path = tmp_path / "a.store"
+def test_a_file_that_is_removed_is_begun_again(path):
     session = Session(path).put(walk(100)).write()
     path.unlink()
     session.put(walk(200, 100)).write()
@@ -300,8 +302,7 @@ def test_a_file_that_is_replaced_is_left_alone(tmp_path):
     assert path.read_bytes() == content
 
 
-def test_episodes_that_left_the_history_are_continued(tmp_path):
-    path = tmp_path / "a.store"
+def test_episodes_that_left_the_history_are_continued(path):
     batch = walk(9000)
     batch.value[200:400] += 30.0
     first = Session(path)
@@ -322,10 +323,9 @@ def test_episodes_that_left_the_history_are_continued(tmp_path):
     after.running.stop()
 
 
-def test_commands_of_users_are_kept(tmp_path, monkeypatch):
+def test_commands_of_users_are_kept(path, monkeypatch):
     """Those of one gesture are one entry; only the last ones are read again."""
     monkeypatch.setattr("app.engine.store.MAX_COMMANDS", 3)
-    path = tmp_path / "a.store"
     before = Session(path).put(walk(50))
     audit, ann = before.engine.audit, ("ann", "tune", "10.0.0.3")
     for value in range(5):
@@ -362,8 +362,7 @@ session.kill()
 
 
 @pytest.mark.skipif(sys.platform == "win32", reason="has no limit of file sizes")
-def test_a_full_disk_is_one_line_and_everything_is_written_once_there_is_room(tmp_path):
-    path = tmp_path / "a.store"
+def test_a_full_disk_is_one_line_and_everything_is_written_once_there_is_room(path):
     told = run_python(FULL, path)
     failed, again = told.stdout.splitlines()
     assert failed.startswith(f"store {path}: ") and "the disk is full" in failed

@@ -15,8 +15,8 @@ from app.extensions.alerts import mail
 from app.extensions.alerts.command import CommandReceiver
 from app.extensions.alerts.mail import Mail
 from app.extensions.alerts.schema import CommandSection, EmailSection
-from tests.app.engine.outputs.pushed import push
-from tests.app.engine.outputs.test_alerts import assert_fails, publishing
+from tests.app.engine.outputs.pushed import publishing, push
+from tests.app.engine.outputs.test_alerts import assert_fails, started
 from tests.waiting import LIMIT_S, wait_for
 
 
@@ -45,7 +45,7 @@ def test_an_alert_is_sent_by_mail_and_to_a_program(serve, tmp_path):
         "mail": {"type": "email", "to": "ops@plant", "sender": "nisus@plant", **place},
         "log": {"type": "command", "command": [sys.executable, "-c", program, str(file)]},
     }
-    with publishing(serve, receivers) as page:
+    with publishing(serve, started(receivers)) as page:
         for k in range(30):
             push(page, (k, 50.0))
         # The program of the command has ended then.

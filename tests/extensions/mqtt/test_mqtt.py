@@ -1,6 +1,7 @@
 """MQTT at a real broker: states and alerts out, measurements in, and a broker that goes and comes back."""
 
 import json
+from contextlib import contextmanager
 from types import SimpleNamespace
 
 import jsonschema
@@ -8,14 +9,13 @@ import pytest
 from paho.mqtt.packettypes import PacketTypes
 from paho.mqtt.reasoncodes import ReasonCode
 
-from app.engine.outputs.publisher import Publisher
 from app.engine.outputs.state_message import state_schema
 from app.extensions.mqtt.source import MqttSource, TopicMap
 from app.twin.twin import load_twin
 from estimators.errors import ConfigError
 from sources.messages import Messages
-from sources.source import Channel, ignore
-from tests.app.engine.outputs.pushed import BEGIN, push, pushed_twin
+from sources.source import Channel
+from tests.app.engine.outputs.pushed import BEGIN, publishing, push, pushed_twin
 from tests.app.scripted import notice_texts
 from tests.cases import cases
 from tests.extensions.mqtt.broker import Listener
@@ -25,27 +25,17 @@ from tests.waiting import wait_for
 ROOT = "nisus/motor_winding"
 
 
-@pytest.fixture
-def listener(broker):
-    made = Listener(broker)
-    yield made
-    made.stop()
-
-
-def published(serve, broker, source="{type: push}", behind=None, **sections):
-    """A served twin and its publisher, which is connected."""
-    outputs = {"every": 0, "mqtt": {"host": "127.0.0.1", "port": broker.port}} | sections.pop("outputs", {})
-    twin = pushed_twin(outputs, source, **{k: json.dumps(v) for k, v in sections.items()})
-    page = serve(twin=twin, behind=lambda _: twin.open_source(ignore))
-    page.engine.published = Publisher(page.engine)
-    page.engine.published.start()
-    wait_for(lambda: page.engine.published.json()["outputs"][0]["connected"])
-    return page
+@contextmanager
+def published(serve, broker, receivers=None, **more):
+    """A served twin while its publisher is connected."""
+    outputs = {"every": 0, "mqtt": {"host": "127.0.0.1", "port": broker.port}, "receivers": receivers or {}}
+    with publishing(serve, pushed_twin(outputs, **more)) as page:
+        wait_for(lambda: page.engine.published.json()["outputs"][0]["connected"])
+        yield page
 
 
 def test_the_state_is_published_with_birth_and_last_will(serve, broker, listener):
-    page = published(serve, broker)
-    try:
+    with published(serve, broker) as page:
         push(page, (0, 41.0), (1, 42.0))
         wait_for(lambda: [m for m in listener.of(f"{ROOT}/state") if m["time_ns"] == BEGIN + SECOND])
         served = page.get("/api/state")
@@ -68,25 +58,21 @@ def test_the_state_is_published_with_birth_and_last_will(serve, broker, listener
         }  # fmt: skip
         assert late.of(f"{ROOT}/status")[0]["online"]
         late.stop()
-    finally:
-        page.engine.published.stop()
     wait_for(lambda: not listener.of(f"{ROOT}/status")[-1]["online"])
 
 
 def test_a_twin_that_is_cut_off_is_told_by_the_broker(serve, broker, listener):
-    page = published(serve, broker)
-    wait_for(lambda: listener.of(f"{ROOT}/status"))
-    # As with a process that is killed: the socket ends without a farewell.
-    (mqtt,) = page.engine.published._parts.outputs
-    mqtt.client.socket().shutdown(2)
-    wait_for(lambda: [m["online"] for m in listener.of(f"{ROOT}/status")][:2] == [True, False])
-    page.engine.published.stop()
+    with published(serve, broker) as page:
+        wait_for(lambda: listener.of(f"{ROOT}/status"))
+        # As with a process that is killed: the socket ends without a farewell.
+        (mqtt,) = page.engine.published._parts.outputs
+        mqtt.client.socket().shutdown(2)
+        wait_for(lambda: [m["online"] for m in listener.of(f"{ROOT}/status")][:2] == [True, False])
 
 
 def test_a_broker_that_is_lost_and_back_delays_nothing_and_is_reported(serve, broker):
-    page = published(serve, broker, outputs={"receivers": {"bus": {"type": "mqtt"}}},
-                     alerts=[{"state": "temperature", "above": 45, "after": 0}])  # fmt: skip
-    try:
+    alerts = "[{state: temperature, above: 45, after: 0}]"
+    with published(serve, broker, {"bus": {"type": "mqtt"}}, alerts=alerts) as page:
         broker.stop()
         wait_for(lambda: not page.get("/api/alerts")["outputs"][0]["connected"])
         push(page, *((k, 50.0) for k in range(30)))
@@ -102,15 +88,15 @@ def test_a_broker_that_is_lost_and_back_delays_nothing_and_is_reported(serve, br
         assert listener.of(f"{ROOT}/state")[0]["time_ns"] >= BEGIN + 29 * SECOND
         wait_for(lambda: any("connected again" in text for text in notice_texts(page.engine)))
         listener.stop()
-    finally:
-        page.engine.published.stop()
 
 
 def received(serve, broker, topics):
-    """A served twin that reads topics of the broker."""
+    """A served twin that reads topics of the broker, to which it is connected."""
     source = {"type": "mqtt", "host": "127.0.0.1", "port": broker.port, "topics": topics}
     twin = load_twin("motor_winding", overrides={"source": json.dumps(source), "time.tick": "1000"})
-    return serve(twin=twin, behind=lambda report: twin.open_source(page_report))
+    page = serve(twin=twin, behind=lambda report: twin.open_source(page_report))
+    wait_for(page.engine.source.inner.connected.is_set)
+    return page
 
 
 def page_report(key, text):
@@ -124,7 +110,6 @@ def test_measurements_come_from_topics_each_once_and_bad_ones_are_missing(serve,
     REPORTED.clear()
     mapped = {"values": {"winding": "data.t"}, "time": "ts", "unit": "ms", "quality": "q", "sequence": "n"}
     page = received(serve, broker, {"plant/number": "winding", "plant/+/json": mapped, "plant/message": None})
-    wait_for(lambda: page.engine.source.inner.connected.is_set())
     at = BEGIN // 10**6
     listener.publish("plant/a/json", {"data": {"t": 40.0}, "ts": at, "q": "Good", "n": 1})
     listener.publish("plant/a/json", {"data": {"t": 40.0}, "ts": at, "q": "Good", "n": 1})
@@ -140,15 +125,6 @@ def test_measurements_come_from_topics_each_once_and_bad_ones_are_missing(serve,
         "plant/a/json: the payload has no 'data.t'; it is not used",
         "plant/a/json: the payload is no JSON and no number; it is not used",
     ]
-
-
-def test_a_retained_number_without_a_time_is_of_no_moment(serve, broker, listener):
-    listener.publish("plant/number", "99.0", retain=True)
-    page = received(serve, broker, {"plant/number": "winding"})
-    wait_for(lambda: page.engine.source.inner.connected.is_set())
-    listener.publish("plant/number", "41.0")
-    wait_for(lambda: page.rows() == 1)
-    assert abs(page.get("/api/state")["states"][0]["value"] - 41.0) < 20.0
 
 
 def test_no_retained_payload_without_a_time_is_used_and_a_topic_that_is_refused_is_reported():
@@ -178,7 +154,6 @@ def test_no_retained_payload_without_a_time_is_used_and_a_topic_that_is_refused_
 def test_a_source_whose_broker_comes_back_goes_on(serve, broker):
     REPORTED.clear()
     page = received(serve, broker, {"plant/number": "winding"})
-    wait_for(lambda: page.engine.source.inner.connected.is_set())
     broker.stop()
     wait_for(lambda: REPORTED)
     assert f"no measurements from the broker at 127.0.0.1:{broker.port}" in REPORTED[0][1]

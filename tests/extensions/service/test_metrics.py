@@ -7,8 +7,8 @@ from pathlib import Path
 
 from prometheus_client.parser import text_string_to_metric_families
 
-from tests.app.engine.outputs.pushed import push
-from tests.app.engine.outputs.test_alerts import DEAD, publishing
+from tests.app.engine.outputs.pushed import publishing, push
+from tests.app.engine.outputs.test_alerts import DEAD, started
 from tests.app.web.test_state_api import page, state
 from tests.waiting import wait_for
 
@@ -55,7 +55,7 @@ def test_problems_are_counted_by_kind_and_the_dashboard_asks_for_what_there_is(p
 
 
 def test_alerts_are_counted_by_receiver(serve, hook):
-    with publishing(serve, {"dead": DEAD, "ops": hook.section}) as page:
+    with publishing(serve, started({"dead": DEAD, "ops": hook.section})) as page:
         for k in range(30):
             push(page, (k, 50.0))
 

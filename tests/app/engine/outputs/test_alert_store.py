@@ -2,9 +2,7 @@
 
 import json
 import signal
-import sqlite3
 import zlib
-from contextlib import closing
 
 import pytest
 
@@ -13,12 +11,12 @@ from app.engine.outputs import alert_store
 from app.engine.outputs.alert_store import AlertStore
 from app.engine.outputs.alerts import SETTLE_S
 from app.engine.outputs.receivers import Deliveries
-from app.engine.store import FORMAT
 from app.twin.secrets import NO_SECRETS
 from config.output_schema import WebhookSection
 from estimators.errors import SourceError
-from tests.app.engine.outputs.pushed import push
-from tests.app.engine.outputs.test_alerts import Looked, episode, publishing, started, state
+from tests.app.engine.outputs.pushed import publishing, push
+from tests.app.engine.outputs.test_alerts import Looked, Receiver, episode, started, state
+from tests.app.engine.test_store import ANOTHER, rewritten
 from tests.support import run_python
 from tests.waiting import LIMIT_S, wait_for
 
@@ -86,24 +84,11 @@ def test_the_alerts_of_episodes_and_of_rules_that_were_removed_are_resolved():
     assert last.text == "the rule episode was removed: winding: it is stuck"
 
 
-class Receiver:
-    """Takes alerts unless it is dead."""
-
-    def __init__(self):
-        self.dead, self.got = False, []
-
-    def send(self, alert):
-        if self.dead:
-            raise OSError("refused")
-        self.got.append(alert)
-
-
 class Process:
     """Rules, receivers and file of one process; its threads are those of the test."""
 
     def __init__(self, folder, monkeypatch, owner="motor", make=Looked, dead=False, **rule):
-        self.receiver = Receiver()
-        self.receiver.dead = dead
+        self.receiver = Receiver(dead)
         monkeypatch.setattr("app.engine.outputs.receivers.make_receivers", lambda *_: {"ops": self.receiver})
         self.notices = Notices(lambda: 0)
         section = WebhookSection(type="webhook", url="http://127.0.0.1:9/")
@@ -156,19 +141,11 @@ def test_an_alert_is_stored_before_it_is_sent_and_told_once(tmp_path, monkeypatc
     assert fifth.deliver() == [] and fifth.said() == []
 
 
-def rewritten(sql):
-    def spoil(path):
-        with closing(sqlite3.connect(path, isolation_level=None)) as file:
-            file.execute(sql)
-
-    return spoil
-
-
 @pytest.mark.parametrize(
     ("spoil", "reason"),
     [
         (lambda path: path.write_text("a: text\n" * 1000), "is no store of Nisus; choose another path"),
-        (rewritten(f"PRAGMA user_version={FORMAT + 1}"), f"has format {FORMAT + 1}, this version reads {FORMAT}; rem"),
+        ANOTHER,
         (rewritten("UPDATE parts SET crc = 1"), "is damaged; remove it, or choose another path"),
         (
             rewritten(f"UPDATE parts SET data = x'7b7d', crc = {zlib.crc32(b'{}')}"),
@@ -255,7 +232,7 @@ os.kill(os.getpid(), signal.SIGKILL)
 def test_a_yaml_that_is_saved_while_an_alert_is_open_does_not_begin_it_again(serve, hook, monkeypatch):
     monkeypatch.setattr("app.engine.outputs.alerts.SETTLE_S", 0.0)
     rule = "{state: temperature, above: 45, after: 0, clear: 0}"
-    with publishing(serve, {"log": hook.section}, f"[{rule}]") as page:
+    with publishing(serve, started({"log": hook.section}, f"[{rule}]")) as page:
         publisher = page.engine.published
         for k in range(30):
             push(page, (k, 50.0))

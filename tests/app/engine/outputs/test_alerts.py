@@ -4,7 +4,6 @@ import hashlib
 import hmac
 import sys
 import threading
-from contextlib import contextmanager
 from http.server import BaseHTTPRequestHandler, HTTPServer
 from types import SimpleNamespace
 
@@ -20,8 +19,7 @@ from app.twin.twin import load_twin
 from config.output_schema import AlertSection, WebhookSection
 from estimators.diagnostics.episodes import Episode
 from estimators.errors import ConfigError
-from sources.source import ignore
-from tests.app.engine.outputs.pushed import push, pushed_twin
+from tests.app.engine.outputs.pushed import publishing, push, pushed_twin
 from tests.app.scripted import notice_texts
 from tests.cases import cases
 from tests.support import error_of
@@ -133,21 +131,8 @@ def test_nothing_is_sent_while_muted_or_after_a_maintenance():
 
 
 def started(receivers, alerts="[{state: temperature, above: 45, after: 0, clear: 0}]"):
-    """A twin whose measurements come by `push`, with its publisher."""
+    """A twin whose measurements come by `push`, with receivers of alerts."""
     return pushed_twin({"receivers": receivers}, alerts=alerts)
-
-
-@contextmanager
-def publishing(serve, receivers, *alerts, **options):
-    """The page of a twin of `started` while its publisher runs."""
-    twin = started(receivers, *alerts)
-    page = serve(twin=twin, behind=lambda _: twin.open_source(ignore))
-    publisher = page.engine.published = Publisher(page.engine, **options)
-    publisher.start()
-    try:
-        yield page
-    finally:
-        publisher.stop()
 
 
 DEAD = {"type": "webhook", "url": "http://127.0.0.1:9/"}
@@ -156,7 +141,7 @@ DEAD = {"type": "webhook", "url": "http://127.0.0.1:9/"}
 def test_every_receiver_gets_the_alert_although_one_is_dead(serve, hook, monkeypatch):
     monkeypatch.setenv("NISUS_TEST_SECRET", "a key")
     ops = hook.section | {"secret_env": "NISUS_TEST_SECRET", "heartbeat": 3600}
-    with publishing(serve, {"dead": DEAD, "ops": ops}, page="http://127.0.0.1:9900") as page:
+    with publishing(serve, started({"dead": DEAD, "ops": ops}), page="http://127.0.0.1:9900") as page:
         for k in range(30):
             push(page, (k, 50.0))
         wait_for(lambda: len(hook.received) == 2)
@@ -180,19 +165,28 @@ def test_every_receiver_gets_the_alert_although_one_is_dead(serve, hook, monkeyp
         assert hook.alerts[-1]["id"] == alert["id"]
 
 
-def test_a_receiver_that_failed_gets_what_waited_in_order_and_a_full_queue_drops_the_oldest():
-    class Flaky:
-        def __init__(self):
-            self.dead, self.got = True, []
+class Receiver:
+    """Takes alerts unless it is dead."""
 
-        def send(self, alert):
-            if self.dead:
-                raise OSError("refused")
-            self.got.append(alert.sent)
+    def __init__(self, dead=True):
+        self.dead, self.got = dead, []
 
-    receiver, said = Flaky(), []
+    def send(self, alert):
+        if self.dead:
+            raise OSError("refused")
+        self.got.append(alert)
+
+
+def delivering(receiver):
+    """The delivery to a receiver, whose steps are those of the test, and what it says."""
+    said = []
     notices = SimpleNamespace(say=lambda text, level="info": said.append(text), count=lambda key: None)
-    delivery = Delivery("ops", receiver, notices)
+    return Delivery("ops", receiver, notices), said
+
+
+def test_a_receiver_that_failed_gets_what_waited_in_order_and_a_full_queue_drops_the_oldest():
+    receiver = Receiver()
+    delivery, said = delivering(receiver)
     alerts = [
         heartbeat("motor", "tracking").model_copy(update={"status": "firing", "sent": str(k)})
         for k in range(MAX_WAITING_ALERTS + 2)
@@ -203,7 +197,7 @@ def test_a_receiver_that_failed_gets_what_waited_in_order_and_a_full_queue_drops
     assert (delivery.dropped, delivery.failing) == (2, True)
     receiver.dead = False
     delivery.step()
-    assert receiver.got == [alert.sent for alert in alerts[2:]] and not delivery.waiting
+    assert receiver.got == alerts[2:] and not delivery.waiting
     assert said == [
         "alerts: receiver ops fails (refused); they wait, and it is tried again",
         "alerts: receiver ops takes them again",
@@ -219,9 +213,7 @@ def test_an_answer_that_is_no_success_counts_as_a_failure_and_is_not_followed(ho
 
 def assert_fails(receiver, reason):
     """An alert waits, is tried again, and the failure is told in one line."""
-    said = []
-    notices = SimpleNamespace(say=lambda text, level="info": said.append(text), count=lambda key: None)
-    delivery = Delivery("ops", receiver, notices)
+    delivery, said = delivering(receiver)
     delivery.put(heartbeat("motor", "tracking"))
     assert delivery.step() == 1.0 and delivery.step() == 2.0
     assert delivery.failing and delivery.waiting == 1
@@ -266,9 +258,6 @@ def test_a_receiver_that_answers_byte_by_byte_fails_after_the_timeout(dripping, 
 
 def test_a_mute_is_asked_for_by_a_command(serve):
     page = serve(3)
-    assert page.command("MuteAlerts", seconds=1e9) == (
-        "MuteAlerts: seconds is 1e+09; it must be from 0 to 2592000, 30 days"
-    )
     page.post("/api/command", command="MuteAlerts", seconds=3600, reason="cleaning")
     wait_for(lambda: page.engine.mute is not None and page.engine.mute.active)
     assert "alerts are muted for 60 min: cleaning" in notice_texts(page.engine)
