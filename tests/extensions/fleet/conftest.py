@@ -1,5 +1,5 @@
-"""The broker of MQTT's tests."""
+"""The broker and the client of MQTT's tests."""
 
-from tests.extensions.mqtt.conftest import broker
+from tests.extensions.mqtt.conftest import broker, listener
 
-__all__ = ["broker"]
+__all__ = ["broker", "listener"]

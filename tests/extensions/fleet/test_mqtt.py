@@ -38,8 +38,8 @@ def send(fleet, first, last, assets):
     fleet.step()
 
 
-def test_each_asset_that_changed_is_published_with_the_estimate_of_its_own_fold(tmp_path, broker):
-    fleet, listener = started(tmp_path, broker), Listener(broker)
+def test_each_asset_that_changed_is_published_with_the_estimate_of_its_own_fold(tmp_path, broker, listener):
+    fleet = started(tmp_path, broker)
     publisher = FleetPublisher(fleet)
     send(fleet, 0, 5, ASSETS)
     publisher.start()
@@ -76,12 +76,11 @@ def test_each_asset_that_changed_is_published_with_the_estimate_of_its_own_fold(
         again.stop()
     finally:
         publisher.stop()
-        listener.stop()
         fleet.stop()
 
 
-def test_alerts_are_published_under_the_fleet(tmp_path, broker):
-    fleet, listener = started(tmp_path, broker, alerts=[{"health": "degraded", "after": 0}]), Listener(broker)
+def test_alerts_are_published_under_the_fleet(tmp_path, broker, listener):
+    fleet = started(tmp_path, broker, alerts=[{"health": "degraded", "after": 0}])
     publisher = FleetPublisher(fleet)
     send(fleet, 0, 30, ASSETS)
     publisher.start()
@@ -93,7 +92,6 @@ def test_alerts_are_published_under_the_fleet(tmp_path, broker):
         assert alert["status"] == "firing" and {*alert["fired"]} == {*ASSETS[1:]}
     finally:
         publisher.stop()
-        listener.stop()
         fleet.stop()
     assert not listener.of("nisus/pumps/status")[-1]["online"]
 

@@ -1,7 +1,6 @@
 """Fleets of messages, by HTTP and MQTT: each asset has the values of a fold over its own messages."""
 
 import asyncio
-import io
 import json
 import os
 import signal
@@ -10,7 +9,6 @@ from contextlib import nullcontext
 from types import MappingProxyType, SimpleNamespace
 
 import numpy as np
-import pyarrow as pa
 import pytest
 from starlette.applications import Starlette
 
@@ -27,10 +25,10 @@ from estimators.track import HEALTH_NAMES, STALE, USABLE
 from sources.messages import FORGOTTEN
 from sources.source import NO_ASSET
 from tests import ROOT
+from tests.app.web.test_readings_api import arrow
 from tests.benchmarks.kills import FleetRun, survive_fleet
 from tests.cases import cases
 from tests.extensions.fleet.test_command import FLEET, write
-from tests.extensions.mqtt.broker import Broker, Listener
 from tests.skips import program
 from tests.support import as_log, error_of, run_python
 from tests.waiting import LIMIT_S, wait_for
@@ -71,12 +69,8 @@ def test_messages_have_the_asset_as_a_field_in_any_form(kind, tmp_path):
     source = messages_of(fleet)
     sent = [message(k, asset, 40.0 + k + j) for k in range(6) for j, asset in enumerate(("a", "b/c"))]
     if "arrow" in kind:
-        rows = [{"time": item["time"], "asset": item["asset"], **item["values"]} for item in sent]
-        batch = pa.RecordBatch.from_pylist(rows)
-        sink = io.BytesIO()
-        with pa.ipc.new_stream(sink, batch.schema) as stream:
-            stream.write_batch(batch)
-        body = sink.getvalue()
+        columns = {key: [item[key] for item in sent] for key in ("time", "asset")}
+        body = arrow(columns | {"winding": [item["values"]["winding"] for item in sent]})
     elif "ndjson" in kind:
         body = "\n".join(map(json.dumps, sent)).encode()
     else:
@@ -222,15 +216,13 @@ def test_a_clock_that_was_wrong_for_a_while_costs_its_asset_seconds_and_no_other
 
 
 @pytest.mark.parametrize("group", ["", "$share/fleets/"])
-def test_the_asset_is_a_level_of_the_topic(tmp_path, group):
-    broker = Broker(tmp_path)
+def test_the_asset_is_a_level_of_the_topic(tmp_path, broker, listener, group):
     topics = {
         f"{group}plant/{{asset}}/temperature": "winding",
         "line/{asset}": {"values": {"winding": "v"}, "time": "t"},
     }
     fleet, said = running(tmp_path, {"type": "mqtt", "host": "127.0.0.1", "port": broker.port, "topics": topics})
     assert fleet.source.connected.wait(LIMIT_S)
-    listener = Listener(broker)
     listener.publish("plant/pump 3/temperature", "41.5")
     listener.publish("line/pump 4", {"v": 42.5, "t": time.time_ns()})
     listener.publish("plant//temperature", "41.5")
@@ -238,9 +230,7 @@ def test_the_asset_is_a_level_of_the_topic(tmp_path, group):
     _, names, table = fleet.table()
     assert names == ["pump 3", "pump 4"] and table.events.tolist() == [1, 1]
     assert said[0].startswith("plant//temperature: asset is ''; it must be a text")
-    listener.stop()
     fleet.stop()
-    broker.stop()
 
 
 @cases(__file__, "fleet_topics.csv")
@@ -455,10 +445,8 @@ def test_packets_that_are_sent_again_count_once(tmp_path, monkeypatch):
     fleet.stop()
 
 
-def test_a_broker_keeps_what_was_not_stored(tmp_path, monkeypatch):
+def test_a_broker_keeps_what_was_not_stored(tmp_path, broker, listener, monkeypatch):
     monkeypatch.setattr(live, "STORE_PERIOD_S", 1e9)
-    broker = Broker(tmp_path)
-    listener = Listener(broker)
     named = ["pump 3", "pump 4", "pump 5"]
     before, said = running(tmp_path, mqtt(broker.port), assets=named)
     before.stop()
@@ -492,8 +480,6 @@ def test_a_broker_keeps_what_was_not_stored(tmp_path, monkeypatch):
         path = tmp_path / "pumps.yaml"
         path.write_text(json.dumps({"twin": "motor_winding", "source": mqtt(broker.port, qos=2)}))
         RunningFleet(load_fleet(path), lambda *_: None, threads=1, store=tmp_path / "new.store")
-    listener.stop()
-    broker.stop()
 
 
 def test_killed_processes_leave_the_table_of_one_that_was_not(tmp_path):
