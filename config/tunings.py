@@ -90,13 +90,6 @@ def find_version(twin: Path, reference: str) -> Version | None:
     return load_version(files[reference])
 
 
-def accepted_version(twin: Path) -> Version | None:
-    """Return the version that was accepted last; None if the twin's own file is in use."""
-    found = [load_version(path) for path in version_files(twin).values()]
-    accepted = [version for version in found if version.head.accepted is not None]
-    return max(accepted, key=lambda version: version.head.accepted.at, default=None)  # type: ignore[union-attr]
-
-
 def load_version(path: Path) -> Version:
     """Read and check a version's file.
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 import time
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -79,17 +79,22 @@ def listing(twin: Twin) -> list[dict[str, Any]]:
         except ConfigError as error:
             broken.append({"name": name, "error": str(error)})
     versions.sort(key=lambda version: (version.head.saved, version.name))
-    accepted = max((v.head.accepted.at for v in versions if v.head.accepted is not None), default=None)
+    accepted = last_accepted(versions)
     own = twin.loaded.without or twin.loaded
     found: list[dict[str, Any]] = [
         {"name": OWN_VALUES, "estimator": own.config.estimator.name, "holds": accepted is None}
     ]
     for version in versions:
         estimator = version.section.estimator or own.config.estimator
-        holds = version.head.accepted is not None and version.head.accepted.at == accepted
         head = version.head.model_dump(mode="json")
-        found.append({"name": version.name, "estimator": estimator.name, "holds": holds, **head})
+        found.append({"name": version.name, "estimator": estimator.name, "holds": version is accepted, **head})
     return found + broken
+
+
+def last_accepted(versions: Iterable[Version]) -> Version | None:
+    """Return the version that was accepted last; None if the twin's own file is in use."""
+    accepted = [version for version in versions if version.head.accepted is not None]
+    return max(accepted, key=lambda version: version.head.accepted.at, default=None)  # type: ignore[union-attr]
 
 
 def figures(found: Score) -> dict[str, float]:

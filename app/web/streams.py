@@ -130,7 +130,7 @@ class PageStream:
         while True:
             try:
                 text = await self._browser.receive_text()
-            except (WebSocketDisconnect, KeyError):
+            except (WebSocketDisconnect, KeyError, RuntimeError):  # the last where a message to it could not be sent
                 return
             if len(text) > MAX_BODY_BYTES:
                 return

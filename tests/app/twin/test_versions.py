@@ -18,9 +18,9 @@ from app.record.reader import read_recording
 from app.twin.log_reader import read_log
 from app.twin.tuning_yaml import tuning_yaml, with_tuning
 from app.twin.twin import load_twin, restore_twin, with_held
-from app.twin.versions import Settings, accept, apply_tuning, keep, version_text
+from app.twin.versions import Settings, accept, apply_tuning, keep, last_accepted, listing, version_text
 from config.loader import TWINS, shipped
-from config.tunings import accepted_version, find_version, folders, load_version, version_files
+from config.tunings import find_version, folders, load_version, version_files
 from estimators.errors import ConfigError
 from estimators.fit.uncertainty import ParameterWidths
 from estimators.registry import ESTIMATORS
@@ -265,11 +265,10 @@ def test_kept_listed_compared_accepted(winding, nisus):
 
     compared = nisus("tunings", winding, "quiet", "loud", "--json").json
     assert compared["entries"] == [{"key": "R.winding", "values": [0.5, 9.0]}]
-    assert accepted_version(winding) is None
     before = find_version(winding, "quiet")
     nisus("tunings", winding, "--accept", "quiet", "--note", "it is")
-    version = accepted_version(winding)
-    assert version.name == "quiet" and version.head.accepted.note == "it is"
+    version = find_version(winding, "quiet")
+    assert last_accepted([before, version]) is version and version.head.accepted.note == "it is"
     assert version.head.model_copy(update={"accepted": None}) == before.head
     assert {**version.data, "version": 0} == {**before.data, "version": 0}
     assert "quiet *" in nisus("tunings", winding).out
@@ -281,7 +280,7 @@ def test_the_last_that_was_accepted_holds(winding, monkeypatch):
         path = kept(twin, name)
         monkeypatch.setattr("app.twin.versions.now", lambda k=k: f"2026-11-2{k}T00:00:00Z")
         accept(load_version(path), "")
-    assert accepted_version(winding).name == "a"
+    assert [item["name"] for item in listing(twin) if item["holds"]] == ["a"]
 
 
 def test_versions_of_a_twin_that_ships_go_to_the_users_folder(tmp_path, monkeypatch):

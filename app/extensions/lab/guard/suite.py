@@ -17,11 +17,11 @@ from app.study.compare import draws, tidy, within
 from app.study.processes import results
 from app.twin.log_reader import read_log
 from app.twin.twin import Twin, load_twin, restore_twin
-from app.twin.versions import COVERAGE, RMSE, VERDICT_FILE, now, verdicts
+from app.twin.versions import COVERAGE, RMSE, VERDICT_FILE, last_accepted, now, verdicts
 from config.companion_schema import AcceptedSection
 from config.loader import find, shipped
 from config.source_schema import SimulatorSection
-from config.tunings import OWN_VALUES, Version, accepted_version, folders, named, ships
+from config.tunings import OWN_VALUES, Version, folders, load_version, named, ships, version_files
 from config.yaml_files import shown_path
 from estimators.errors import ConfigError, NisusError, SourceError, printable
 from estimators.fold import Fold
@@ -82,6 +82,11 @@ class GuardVerdict:
     failure: str = ""
     absent: str = ""
     seconds: float = 0.0
+
+
+def accepted_version(twin: Path) -> Version | None:
+    """Return the tuning version that guards fold a twin with; None for its own file."""
+    return last_accepted(map(load_version, version_files(twin).values()))
 
 
 def of_twin(name: str) -> GuardedLog:
