@@ -2,10 +2,14 @@
 
 import asyncio
 import threading
+from unittest.mock import AsyncMock
 
 import pytest
 
+from app.charts.series import Series
 from app.web.request_threads import RequestThreads
+from app.web.streams import PageStream
+from tests.app.scripted import Stepped, notice_texts
 from tests.waiting import LIMIT_S
 
 
@@ -60,3 +64,15 @@ def test_a_cancelled_request_ends_after_its_work():
         assert done == ["ab"]
 
     asyncio.run(cancelled())
+
+
+def test_a_browser_that_leaves_while_it_is_told_is_no_error():
+    """Once a message could not be sent, Starlette refuses to receive."""
+    left = RuntimeError('WebSocket is not connected. Need to call "accept" first.')
+    browser = Mock(
+        accept=AsyncMock(), send_text=AsyncMock(), close=AsyncMock(), receive_text=AsyncMock(side_effect=left)
+    )
+    engine = Stepped().engine
+    asyncio.run(PageStream(browser, engine, Series(engine), dict, "boot").run())
+    browser.receive_text.assert_awaited_once()
+    assert notice_texts(engine) == []
