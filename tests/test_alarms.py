@@ -78,6 +78,7 @@ OF_THE_PROGRAM = {
     "stale",
     "readings",
     "page error",
+    "request failed",
 }
 """Keys of notices that report what is wrong with the program or a disk; the others are no
 alarm, or a state of health."""

@@ -1,5 +1,7 @@
 import json
 import os
+import sys
+from functools import partial
 from pathlib import Path
 from typing import Annotated
 
@@ -75,7 +77,10 @@ def test_what_is_not_a_twin_at_all_is_one_line(text, expected):
     assert message(text) == expected
 
 
-def test_a_text_too_deep_or_with_characters_that_are_none_is_one_line():
+def test_a_text_too_deep_or_with_characters_that_are_none_is_one_line(request):
+    # Libraries raise Python's limit.
+    request.addfinalizer(partial(sys.setrecursionlimit, sys.getrecursionlimit()))
+    sys.setrecursionlimit(1000)
     assert message("[" * 5000) == "motor.yaml:1: it is nested too deeply; a twin needs six levels"
     said = "motor.yaml:2: the character '\\x01' is not text; remove it"
     assert message("model: a\ntitle: '\x01'\n") == said
