@@ -22,13 +22,14 @@ from app.extensions.lab.guard import suite as guard_suite
 from app.extensions.lab.guard.baseline import (
     ALLOWED_SHARE,
     MAX_ALLOWED,
+    ComparedFigure,
     allowances,
     compare_figures,
     fold_figures,
     read_baseline,
 )
 from app.extensions.lab.guard.command import guard
-from app.extensions.lab.guard.suite import of_twin
+from app.extensions.lab.guard.suite import GuardVerdict, keep_last, of_twin
 from app.twin.log_reader import read_log
 from app.twin.twin import load_twin
 from app.twin.versions import Settings, accept, keep, verdicts, version_text
@@ -134,14 +135,20 @@ def test_what_was_said_last_is_kept_beside_the_versions(archive, capsys):
     kept(path, worse_by(path, 0.05))
     assert guarded(archive) == 1
     (worse,), (fine,) = verdicts(path), verdicts(archive / "w0.yaml")
-    assert worse["version"] == "planted"
-    (line,) = [line for line in worse["worse"] if line.startswith("rmse.temperature")]
-    assert re.fullmatch(r"rmse\.temperature was \S+ and is \S+: worse by \S+, allowed \S+", line)
+    assert worse["version"] == "planted" and any(line.startswith("rmse.temperature was ") for line in worse["worse"])
     assert fine["version"] == "own" and fine["figures"] > 5 and not fine["worse"] and not fine["failure"]
     # Of one twin alone: what was said of the others stays; a file that was damaged is no obstacle.
     (archive / "w1.tunings" / "guard.json").write_text("{")
     assert verdicts(archive / "w1.yaml") == [] and guarded(None, archive / "w1.yaml") == 0
     assert verdicts(archive / "w1.yaml")[0]["recording"] == "w1" and verdicts(path) == [worse]
+
+
+def test_a_figure_that_got_worse_is_kept_in_words(tmp_path):
+    worse = ComparedFigure("rmse.temperature", 0.5, 0.6, 0.1, 0.01)
+    keep_last(tmp_path / "winding.yaml", [GuardVerdict("winding", "own", [worse])])
+    (said,) = verdicts(tmp_path / "winding.yaml")
+    assert said["recording"] == "winding" and said["figures"] == 1
+    assert said["worse"] == ["rmse.temperature was 0.5 and is 0.6: worse by 0.1, allowed 0.01"]
 
 
 def test_reruns_are_silent(archive, capsys):
