@@ -168,16 +168,24 @@ def test_a_source_that_begins_to_hold_its_values_is_an_episode(step, std, told):
         )
 
 
-def test_a_refold_replaces_the_whole_history():
+@pytest.mark.parametrize(
+    ("command", "estimator", "tuned"),
+    [
+        (commands.SetEstimator("ukf"), "ukf", FIRST),
+        (commands.SetTuning("Q.rate", 0.1), "kf", FIRST.set("Q.rate", 0.1)),
+        (commands.UseSensor("winding", False), "kf", FIRST.set("use.winding", False)),
+    ],
+)
+def test_a_refold_replaces_the_whole_history(command, estimator, tuned):
     times, values = series(2000)
     stepped = Stepped()
     stepped.put(readings(times, values))
     before, cursor = pull_all(stepped.engine), stepped.engine.cursor()
     stepped.engine.pull(cursor)
-    stepped.submit(commands.UseSensor("winding", False))
+    stepped.submit(command)
     pull = stepped.engine.pull(cursor)
     assert (pull.fresh, pull.first, pull.revision) == (True, 0, 1)
-    assert_same(pull.track, reference(times, values, "kf", FIRST.set("use.winding", False)))
+    assert_same(pull.track, reference(times, values, estimator, tuned))
     assert_same(stepped.engine.revisions.previous().track, before.track)
 
 
