@@ -93,7 +93,7 @@ def test_alerts_are_published_under_the_fleet(tmp_path, broker, listener):
     finally:
         publisher.stop()
         fleet.stop()
-    assert not listener.of("nisus/pumps/status")[-1]["online"]
+    wait_for(lambda: not listener.of("nisus/pumps/status")[-1]["online"])
 
 
 def test_a_state_that_is_not_known_has_no_number():

@@ -52,7 +52,7 @@ def test_the_state_is_published_with_birth_and_last_will(serve, broker, listener
         ]
         assert birth["schema"] == json.loads(json.dumps(state_schema()))
         late = Listener(broker)
-        wait_for(lambda: late.of(f"{ROOT}/status"))
+        wait_for(lambda: late.of(f"{ROOT}/status") and late.of(f"{ROOT}/birth"))
         assert {(topic.rpartition("/")[2], retain) for topic, _, retain in late.heard if "state" not in topic} == {
             ("birth", True), ("status", True),
         }  # fmt: skip
