@@ -113,15 +113,10 @@ def as_list(value: Any) -> Any:
 Texts = Annotated[
     tuple[Text, ...], Field(min_length=1), BeforeValidator(as_list, json_schema_input_type=str | list[str])
 ]
-Numbers = Annotated[
-    tuple[Number, ...], Field(min_length=1), BeforeValidator(as_list, json_schema_input_type=float | list[float])
-]
-Positives = Annotated[
-    tuple[Positive, ...], Field(min_length=1), BeforeValidator(as_list, json_schema_input_type=float | list[float])
-]
-NotNegatives = Annotated[
-    tuple[NotNegative, ...], Field(min_length=1), BeforeValidator(as_list, json_schema_input_type=float | list[float])
-]
+OneOrMore = BeforeValidator(as_list, json_schema_input_type=float | list[float])
+Numbers = Annotated[tuple[Number, ...], Field(min_length=1), OneOrMore]
+Positives = Annotated[tuple[Positive, ...], Field(min_length=1), OneOrMore]
+NotNegatives = Annotated[tuple[NotNegative, ...], Field(min_length=1), OneOrMore]
 
 
 class Section(BaseModel):

@@ -21,8 +21,6 @@ NAME = re.compile(r"[A-Za-z0-9][A-Za-z0-9_.-]{0,59}")
 
 SPREADS = ("variance", "std")  # Alternatives: one replaces the other
 
-SHIPPED = TWINS.parent / "tunings"  # Folder of the versions that ship, a folder for each twin
-
 
 @dataclass(frozen=True)
 class Version:
@@ -59,7 +57,7 @@ def folders(twin: Path) -> tuple[Path, ...]:
     if not ships(twin):
         return (twin.with_name(f"{twin.stem}.tunings"),)
     base = Path(os.environ.get("XDG_DATA_HOME") or Path.home() / ".local" / "share")
-    return (base / "nisus" / "tunings" / twin.stem, SHIPPED / twin.stem)
+    return (base / "nisus" / "tunings" / twin.stem, TWINS.parent / "tunings" / twin.stem)
 
 
 def version_files(twin: Path) -> dict[str, Path]:
