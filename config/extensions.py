@@ -13,10 +13,10 @@ import logging
 import multiprocessing
 import pkgutil
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, fields
 from functools import cache, partial
 from importlib.metadata import EntryPoint, entry_points
-from typing import Any, Literal, NamedTuple, TypeVar, get_args
+from typing import Any, Literal, NamedTuple, TypeVar, get_args, get_type_hints
 
 from estimators.errors import ConfigError, NisusError, printable, reason_of
 
@@ -151,6 +151,8 @@ def schemas(kind: Kind) -> dict[str, Any]:
 def _usable(reference: str, kind: Kind, key: str) -> Any:
     """Return a class of options or sections; one that would stop every twin is refused."""
     schema = pkgutil.resolve_name(reference)
+    if kind == "commands":
+        fields(schema), get_type_hints(schema)  # which `nisus --help` needs of all commands
     if kind in RESERVED:
         from .channels import MessagesSection  # here, as commands without a YAML do not wait for pydantic
         from .fields import Section
@@ -219,7 +221,7 @@ def _tried(name: str, work: Callable[[], T]) -> T | None:
     try:
         return work()
     except (Exception, SystemExit) as error:  # noqa: BLE001  no extension may stop a twin that does not need it
-        _leave_out(name, _gist(error))
+        _leave_out(name, _gist(error).removeprefix(f"extension {name}: "))
         return None
 
 
