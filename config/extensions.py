@@ -41,7 +41,7 @@ Parts = Mapping[str, Part]
 
 @dataclass(frozen=True)
 class Extension:
-    """What a package adds. Parts are registered by name; that of the extension is the one of its entry point."""
+    """Parts that a package adds, by kind and name. The name of the extension is that of its entry point."""
 
     needs: tuple[str, ...] = ()
     """Names of the extensions whose modules it imports."""

@@ -275,7 +275,7 @@ class Running(ABC):
     def settled(self) -> int:
         """Return the absolute index after the last folded event that no late measurement can change any more.
 
-        Of a horizon with many events it is at least the middle of the history, which drops its oldest events.
+        If the horizon has many events, it is at least the middle of the history, which drops its oldest events.
         """
         with self._reading():
             log, n = self._log, self._fold.n

@@ -64,7 +64,7 @@ CHART_FILES = sorted(path.name for path in (PAGE / "charts").glob("*.js"))
 NOT_PUBLISHED: dict[str, Any] = {
     "outputs": [], "receivers": [], "alerts": [], "muted_s": 0.0, "mute_reason": "",
 }  # fmt: skip
-"""Of a recording, which is published nowhere."""
+"""Outputs of a recording, which is published nowhere."""
 
 IMMUTABLE = "public, max-age=31536000, immutable"
 MEDIA_TYPES = {".js": "text/javascript", ".wasm": "application/wasm"}

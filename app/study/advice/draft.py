@@ -32,7 +32,7 @@ MIN_OFFSET, MAX_OFFSETS = 0.1, 16
 """Step of its values, in σ of its noise, from which the only sensor of a state has an offset of that size, and number
 of sensors up to which. Those of several sensors were fitted to each other."""
 MAX_NAME = 100
-"""Longest name of a twin: a file system takes 255 bytes, with the ending and what an archive adds."""
+"""Longest name of a twin: a file system takes 255 bytes, with endings and the names of archives."""
 
 
 @dataclass(frozen=True)

@@ -218,8 +218,8 @@ WALK_INTERVALS = 20  # intervals over which a slow walk is looked for
 def noise_of(series: SignalSeries, smooth: bool | None = None) -> tuple[bool, float, float]:
     """Whether a signal moves smoothly, its process noise in one second, and the variance of its readings.
 
-    Of a random walk with noisy readings, y = x + v, the differences d have E d² = q dt + 2 r and E d_k d_(k+1) = -r. Of
-    one whose speed is a random walk, the second differences e have E e² = ⅔ q dt³ + 6 r and
+    If it is a random walk with noisy readings, y = x + v, its differences d have E d² = q dt + 2 r and
+    E d_k d_(k+1) = -r. If its speed is a random walk, its second differences e have E e² = ⅔ q dt³ + 6 r and
     E e_k e_(k+1) = q dt³/6 - 4 r. It moves smoothly if its differences follow one another, with a correlation above ½,
     which noise alone makes negative; `smooth` decides that in advance. A variance r is at least that of the
     resolution, step²/12.

@@ -71,7 +71,7 @@ class DraftRequest(LogRequest):
 
 
 class ReaderJob(Job):
-    """A generator of a reader process, run in a thread; `item` is what it yielded last."""
+    """A generator of a reader process, run in a thread; `item` is the last one that it yielded."""
 
     def __init__(
         self,

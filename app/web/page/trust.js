@@ -172,7 +172,7 @@ export class Episodes {
       // After a reconnection all arrive again.
       const fresh = event.detail.filter((notice) => notice.number > this.known);
       this.known = Math.max(this.known, ...fresh.map((notice) => notice.number));
-      // A fold of a whole recording tells of its sensors one after another.
+      // The notices of a fold of a whole recording come sensor by sensor.
       const newest = (a, b) => b.run - a.run || b.from - a.from || b.number - a.number;
       this.notices = [...fresh, ...this.notices].sort(newest).slice(0, MAX_EPISODES);
       this.show(this.link.episodes);
