@@ -16,12 +16,12 @@ from collections.abc import Callable
 from contextlib import suppress
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Protocol
+from typing import TYPE_CHECKING
 
 from estimators.errors import SourceError
 
 from ..engine.commands import Record
-from ..engine.jobs import run_all
+from ..engine.jobs import LoopThread, run_all
 from ..record.rrd_file import NEVER, Split
 from ..terminal import complain, until_asked_to_end
 from .door import Door
@@ -101,16 +101,6 @@ def _log_of(opening: OpenedTwin) -> object:
     return opening.twin.path, opening.review, opening.files, repr(opening.twin.config.source)
 
 
-class SessionThread(Protocol):
-    """A thread that starts and stops with the session."""
-
-    def start(self) -> None:
-        """Begin."""
-
-    def stop(self) -> None:
-        """End."""
-
-
 class Session:
     """A process: one page, and behind it one twin at a time, or none; `app/web/gallery` changes it.
 
@@ -150,7 +140,8 @@ class Session:
         self._recorded: list[Path] = []
         self._notes: dict[object, tuple[Annotation, ...]] = {}
         """Notes of users on the twins that ran before, by twin and log."""
-        self.threads: list[SessionThread] = []
+        self.threads: list[LoopThread] = []
+        """Threads that start and stop with the session."""
         if page is not None:
             self.door = Door(page.port, page.grants, public=page.public, overview=page.overview, site=page.site)
         try:
@@ -251,7 +242,7 @@ class Session:
     def stop(self) -> None:
         """Stop everything; a recording is finished."""
         for item in self.threads:
-            item.stop()
+            item.stop(2.0)
         with self._changing:
             ends = [item.stop for item in (self.running, self.door) if item is not None]
             run_all(*ends)

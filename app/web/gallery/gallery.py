@@ -174,25 +174,17 @@ FILE_POLL_PERIOD_S = 0.4
 """Between two looks at the files. An editor may write in pieces: a file is read once it is unchanged."""
 
 
-class SavedFiles:
+class SavedFiles(LoopThread):
     """Watches the files of the running twin, in a thread of its own."""
 
     def __init__(self, gallery: Gallery) -> None:
+        super().__init__(self._poll, "saved files")
         self._gallery = gallery
         # A weak reference does not keep it alive.
         self._of: weakref.ref[RunningTwin] | None = None
         self._files: tuple[Path, ...] = ()
         self._known: Stamp = ()
         self._seen: Stamp = ()
-        self._thread = LoopThread(self._run, "saved files")
-
-    def start(self) -> None:
-        """Begin."""
-        self._thread.start()
-
-    def stop(self) -> None:
-        """End."""
-        self._thread.stop(2.0)
 
     def look(self) -> None:
         """Look once; reload when a file has changed since it was read, but not since the last look."""
@@ -247,8 +239,8 @@ class SavedFiles:
         running.server.unread = text
         running.engine.notices.say(f"not read again: {text}", level="error")
 
-    def _run(self) -> None:
-        while not self._thread.stopping.wait(FILE_POLL_PERIOD_S):
+    def _poll(self) -> None:
+        while not self.stopping.wait(FILE_POLL_PERIOD_S):
             try:
                 self.look()
             except NisusError as error:
