@@ -158,6 +158,10 @@ class EpisodeLog:
                 before = before if again else []
                 self._earlier = self._earlier if again or log < 0 else ()
                 self.tracker = self._new_tracker(pull)
+            elif pull.first > self.tracker.first + self.tracker.n:
+                # The rows between have left the history unseen.
+                self._earlier = tuple(_joined(self._earlier, self.tracker.entries))
+                self.tracker = self._new_tracker(pull)
             self.tracker.feed(pull.events, pull.track, pull.first)
             if len(pull.events) < MAX_PULL_ROWS:
                 break

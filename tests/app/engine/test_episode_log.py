@@ -48,6 +48,11 @@ def whole(engine):
     return episodes(fold)
 
 
+def part(asset, chosen):
+    """Those of its readings."""
+    return readings(*(column[chosen] for column in asset))
+
+
 def watch(engine):
     """Let the episode log look, as its job does."""
     engine._watchers.episode_log.update()
@@ -61,9 +66,8 @@ def same(found, expected):
 
 @pytest.mark.parametrize("piece", [1, 7, 250, N])
 def test_in_pieces_it_is_what_one_fold_says(engine, asset, piece):
-    t, y = asset
     for start in range(0, N, piece):
-        engine._accept([readings(t[start : start + piece], y[start : start + piece])])
+        engine._accept([part(asset, slice(start, start + piece))])
         if piece > 1 or start % 5 == 0:
             watch(engine)
     watch(engine)
@@ -73,15 +77,14 @@ def test_in_pieces_it_is_what_one_fold_says(engine, asset, piece):
 
 
 def test_readings_that_come_late_take_rows_back(engine, asset):
-    t, y = asset
     late = np.arange(280, 520, 3)
     prompt = np.setdiff1d(np.arange(600), late)
-    for part in np.array_split(prompt, 12):
-        engine._accept([readings(t[part], y[part])])
+    for chosen in np.array_split(prompt, 12):
+        engine._accept([part(asset, chosen)])
         watch(engine)
     before = engine.episodes()
-    for part in np.array_split(late[::-1], 5):
-        engine._accept([readings(t[part], y[part])])
+    for chosen in np.array_split(late[::-1], 5):
+        engine._accept([part(asset, chosen)])
         watch(engine)
     same(engine.episodes(), whole(engine))
     assert before != engine.episodes()
@@ -92,7 +95,7 @@ def test_each_is_said_once_when_it_begins_and_when_it_is_over(engine, asset):
     t, y = asset
     lasted, grades = False, []
     for start in range(0, 1580, 8):
-        engine._accept([readings(t[start : start + 8], y[start : start + 8])])
+        engine._accept([part(asset, slice(start, start + 8))])
         watch(engine)
         status = engine.status()
         engine._status = None
@@ -118,10 +121,9 @@ def test_each_is_said_once_when_it_begins_and_when_it_is_over(engine, asset):
 
 def test_what_began_before_the_rows_that_are_kept_is_carried_on(engine, asset):
     """200 noisy readings, and at most 128 rows kept: the end falls where the beginning is forgotten."""
-    t, y = asset
     episode_log, starts = EpisodeLog(engine, max_rows=128), set()
     for start in range(0, 1580, 10):
-        engine._accept([readings(t[start : start + 10], y[start : start + 10])])
+        engine._accept([part(asset, slice(start, start + 10))])
         episode_log.update()
         if episode_log.tracker.first > 337:
             starts.add(episode_log.summary.episodes[0].start)
@@ -144,7 +146,7 @@ def test_what_lasts_hides_no_later_loss(engine, rows):
     y[600:1100] = y[600]
     episode_log = EpisodeLog(engine, max_rows=rows)
     for start in range(0, N, 20):
-        engine._accept([readings(t[start : start + 20], y[start : start + 20])])
+        engine._accept([part((t, y), slice(start, start + 20))])
         episode_log.update()
         if 800 <= start < 1000:
             lasting = {entry.key[0]: entry.episode for entry in episode_log.summary.lasting}
@@ -162,8 +164,8 @@ def test_what_lasts_hides_no_later_loss(engine, rows):
 
 def test_another_revision_begins_anew_and_says_nothing_twice(asset):
     stepped = Stepped()
-    engine, t, y = stepped.engine, asset[0][:400], asset[1][:400]
-    stepped.put(readings(t, y))
+    engine = stepped.engine
+    stepped.put(part(asset, slice(400)))
     watch(engine)
     assert engine.episodes()[-1].end is None and sum("too narrow" in text for text in notice_texts(engine)) == 1
     # As narrow as before, or nearly.
@@ -180,9 +182,9 @@ def test_another_revision_begins_anew_and_says_nothing_twice(asset):
 
 def test_a_source_that_begins_again_has_an_episode_log_of_its_own(asset):
     stepped = Stepped(source=Replayed())
-    engine, t, y = stepped.engine, asset[0][:400], asset[1][:400]
+    engine = stepped.engine
     for begun in (1, 2):
-        stepped.put(readings(t, y))
+        stepped.put(part(asset, slice(400)))
         watch(engine)
         # What lasted in the life before is said again in this one.
         assert sum("too narrow" in text for text in notice_texts(engine)) == begun
@@ -227,3 +229,15 @@ def test_the_cause_is_that_of_an_episode_in_alarm_with_the_grade_of_the_twin(hea
         for start, (subject, name, grade) in enumerate(item.split("/") for item in lasting.split())
     ]
     assert leading(model, found, of, track, np.ones(1))[1] == cause
+
+
+def test_rows_that_left_the_history_unseen_take_no_episode_along(engine, asset):
+    """One is over before them, one lasts beyond them."""
+    longer = 1.0 + np.arange(9200), np.pad(asset[1], (0, 7400), "edge")
+    engine.history, found = 2048, []
+    for rows in np.split(np.arange(9200), [1700]):
+        for chosen in np.array_split(rows, 15):
+            engine._accept([part(longer, chosen)])
+        watch(engine)
+        found.append([each[:4] for each in engine.episodes() if each.cause in ("narrow", "stuck")])
+    assert len(found[0]) == 2 and found[1] == found[0]
