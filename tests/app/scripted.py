@@ -165,12 +165,14 @@ class Stepped:
         for batch in batches:
             self.source.put(batch)
         self.engine.settle()
+        return self
 
     def submit(self, *commands):
         """Carry out commands, and the refolds and jobs that follow from them."""
         for command in commands:
             self.engine.submit(command)
         self.engine.settle()
+        return self
 
     def status(self):
         """A status that is not the cached one."""

@@ -102,8 +102,7 @@ def measured(n, start=0):
 
 
 def stepped_with(n, **options):
-    stepped = Stepped(**options)
-    stepped.put(measured(n))
+    stepped = Stepped(**options).put(measured(n))
     return stepped
 
 
@@ -174,8 +173,7 @@ def test_points_are_no_more_than_asked_for():
 def test_noise_looks_like_noise_from_any_distance(rows):
     """Up to `MAX_DOT_ROWS` all are drawn; of more, a sample with the quartiles of all, and the extremes."""
     noise = np.random.default_rng(1).normal(size=rows)
-    stepped = Stepped(horizon=np.inf)
-    stepped.put(readings(np.arange(1.0, rows + 1.0), noise))
+    stepped = Stepped(horizon=np.inf).put(readings(np.arange(1.0, rows + 1.0), noise))
     viewer = shown(stepped.engine, READING, points=400)
     drawn = viewer.values[READING][np.isfinite(viewer.values[READING])]
     assert drawn.max() == pytest.approx(noise.max(), abs=1e-6) and drawn.min() == pytest.approx(noise.min(), abs=1e-6)
@@ -192,8 +190,7 @@ def test_noise_looks_like_noise_from_any_distance(rows):
 def test_a_peak_of_one_row_is_seen_at_any_scale():
     events = measured(30_000)
     events.value[17_777, 0] = 80.0
-    stepped = Stepped()
-    stepped.put(events)
+    stepped = Stepped().put(events)
     viewer = shown(stepped.engine, READING, f"refused:{ROW}", "nis", points=50)
     assert np.nanmax([viewer.values[READING], viewer.values[f"refused:{ROW}"]]) == pytest.approx(80)
 
@@ -211,8 +208,7 @@ def test_a_late_measurement_replaces_the_rows_from_there_on():
 
 
 def test_rows_of_a_log_that_began_again_replace_those_before_also_where_there_are_none_yet():
-    stepped = Stepped(source=Replayed())
-    stepped.put(measured(700))
+    stepped = Stepped(source=Replayed()).put(measured(700))
     viewer = Viewer(Series(stepped.engine), MEAN, since=10.0, until=60.0)
     viewer.look()
     assert len(viewer.x) > 400
@@ -257,8 +253,7 @@ SECOND_RUN = FIRST.set("Q.rate", 0.1)
 @pytest.fixture
 def stepped():
     """Run 0 is pinned, run 1 with another Q runs."""
-    made = Stepped()
-    made.put(readings(*walk(N)))
+    made = Stepped().put(readings(*walk(N)))
     made.submit(commands.Pin(0), commands.SetTuning("Q.rate", 0.1))
     return made
 
@@ -361,8 +356,7 @@ def test_a_pinned_run_outlives_events_that_were_dropped_before_it_took_them():
 
 
 def test_a_pinned_run_goes_on_where_the_log_begins_again():
-    stepped = Stepped(source=Replayed())
-    stepped.put(readings(*walk(N)))
+    stepped = Stepped(source=Replayed()).put(readings(*walk(N)))
     stepped.submit(commands.Pin(0), commands.SetTuning("Q.rate", 0.1))
     engine = stepped.engine
     pinned = PinnedFold(engine, engine.revisions.find(0))
@@ -387,8 +381,7 @@ def test_a_pinned_run_that_fails_ends_and_its_kept_rows_stay(stepped):
 def test_the_smoothed_run_is_the_smoothed_fold_and_follows_the_running_one(monkeypatch):
     looks = []
     monkeypatch.setattr(Smoother, "__init__", _without_a_job(Smoother.__init__, looks))
-    stepped = Stepped()
-    stepped.put(readings(*walk(N)))
+    stepped = Stepped().put(readings(*walk(N)))
     viewer = Viewer(Series(stepped.engine), MEAN, UPPER, run=SMOOTHED, points=4000)
     assert viewer.look() == 0
 

@@ -154,8 +154,7 @@ def test_particles_over_time():
 
 
 def test_observability_and_cost_come_from_a_background_job():
-    stepped = Stepped()
-    stepped.put(consistent(600))
+    stepped = Stepped().put(consistent(600))
     diagnosis = Diagnosis(stepped.engine)
     assert diagnosis._look()["observability"]["reason"] == "being computed"
     stepped.engine.settle()

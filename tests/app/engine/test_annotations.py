@@ -13,8 +13,7 @@ from tests.support import SECOND
 @pytest.fixture
 def noted():
     """A twin with measurements at 1 to 10 s and two notes, the second of which is earlier."""
-    stepped = Stepped(source=Replayed())
-    stepped.put(readings(range(1, 11), [40.0] * 10))
+    stepped = Stepped(source=Replayed()).put(readings(range(1, 11), [40.0] * 10))
     stepped.submit(Annotate("  pump\n off "), Annotate("door open", at=2.5))
     return stepped
 

@@ -74,8 +74,7 @@ def test_offset_and_drift_are_in_status_page_and_events(live):
 
 
 def test_a_recording_has_no_clock_against_the_host():
-    stepped = Stepped()
-    stepped.put(readings(T, Y))
+    stepped = Stepped().put(readings(T, Y))
     assert stepped.status().clock is None
 
 
@@ -136,8 +135,7 @@ def test_maintenance_that_cannot_be_is_refused_with_the_reason(live, what, state
 def test_planned_maintenance_comes_when_its_time_has_come():
     made = twin()
     made.maintenance = (Planned(150 * SECOND + 1, "new winding", (0, 1)),)
-    stepped = Stepped(of=made, source=Scripted(live=True))
-    stepped.put(arrived(T[:150], Y[:150], at=T[:150]))
+    stepped = Stepped(of=made, source=Scripted(live=True)).put(arrived(T[:150], Y[:150], at=T[:150]))
     assert row_count(stepped.engine) == 150
     stepped.put(arrived(T[150:], Y[150:], at=T[150:]))
     pull = pull_all(stepped.engine)

@@ -123,8 +123,7 @@ def test_a_late_measurement_takes_a_cursor_back():
 
 def test_a_cursor_with_a_span_begins_near_the_end():
     """Also of the next revision; it gets all rows that come or are rewritten later."""
-    stepped = Stepped()
-    stepped.put(readings(np.arange(1.0, 101.0), np.full(100, 40.0)))
+    stepped = Stepped().put(readings(np.arange(1.0, 101.0), np.full(100, 40.0)))
     cursor = stepped.engine.cursor(span=10 * SECOND)
     for revision in (0, 1):
         pull = stepped.engine.pull(cursor)
@@ -138,8 +137,7 @@ def test_a_cursor_with_a_span_begins_near_the_end():
 
 
 def test_measurements_beyond_the_horizon_are_counted_and_dropped():
-    stepped = Stepped()
-    stepped.put(readings([10.0, 7.9, 7.5, 8.1], [40, 41, 43, 42]))
+    stepped = Stepped().put(readings([10.0, 7.9, 7.5, 8.1], [40, 41, 43, 42]))
     assert stepped.engine.notices.counts()["stale"] == 2
     np.testing.assert_array_equal(pull_all(stepped.engine).events.t, np.array([8.1, 10.0]) * SECOND)
     for times in ([*(t - late for t in range(11, 61) for late in (0, 3)), 61], range(62, 1100)):
@@ -178,8 +176,7 @@ def test_a_source_that_begins_to_hold_its_values_is_an_episode(step, std, told):
 )
 def test_a_refold_replaces_the_whole_history(command, estimator, tuned):
     times, values = series(2000)
-    stepped = Stepped()
-    stepped.put(readings(times, values))
+    stepped = Stepped().put(readings(times, values))
     before, cursor = pull_all(stepped.engine), stepped.engine.cursor()
     stepped.engine.pull(cursor)
     stepped.submit(command)
@@ -208,8 +205,7 @@ def test_with_threads_measurements_that_come_during_a_refold_are_not_lost(starte
 
 def test_of_many_slider_values_the_last_one_holds():
     times, values = series(500)
-    stepped = Stepped()
-    stepped.put(readings(times, values))
+    stepped = Stepped().put(readings(times, values))
     stepped.submit(*(commands.SetTuning("Q.rate", float(value)) for value in np.geomspace(1e-4, 1e-1, 50)))
     status = stepped.status()
     assert not status.refolding and status.tuning.get("Q.rate") == pytest.approx(0.1)
@@ -223,8 +219,7 @@ def test_history_is_bounded_and_a_refold_starts_where_it_was_cut(name, options):
     times, values = series(n)
     made = twin(history=2048, estimator=name)
     made.tuning = made.tuning.with_options(options)
-    stepped = Stepped(of=made)
-    stepped.put(*(readings(times[k : k + 500], values[k : k + 500]) for k in range(0, n, 500)))
+    stepped = Stepped(of=made).put(*(readings(times[k : k + 500], values[k : k + 500]) for k in range(0, n, 500)))
     # The count goes on; the rows are bounded.
     status, pull = stepped.status(), pull_all(stepped.engine)
     assert status.t == round(times[-1] * SECOND) and status.counts["readings"] == n
@@ -368,8 +363,7 @@ def test_measurements_that_wait_to_be_folded_are_age_and_health():
 
 def test_a_source_that_begins_again_during_a_refold_gets_no_rows_of_the_old_log():
     times, values = series(300)
-    stepped = Stepped(source=Replayed())
-    stepped.put(readings(times[:200], values[:200]))
+    stepped = Stepped(source=Replayed()).put(readings(times[:200], values[:200]))
     stepped.engine.submit(commands.SetEstimator("ukf"))
     stepped.engine._round(0.0)
     stepped.source.restart()
@@ -381,8 +375,7 @@ def test_a_source_that_begins_again_during_a_refold_gets_no_rows_of_the_old_log(
 
 def test_a_refold_that_fails_leaves_the_running_fold():
     times, values = series(100)
-    stepped = Stepped()
-    stepped.put(readings(times, values))
+    stepped = Stepped().put(readings(times, values))
     stepped.submit(commands.SetTuning("Q.rate", 0.1))
     engine = stepped.engine
     engine.retune("enkf", engine.tuning.with_options({"radius": 5.0}))
@@ -416,8 +409,7 @@ class Told:
 @pytest.mark.parametrize(("estimator", "options", "ends"), [("ukf", {}, "ukf"), ("enkf", {"radius": 5.0}, "kf")])
 def test_nobody_sees_the_old_rows_without_a_refold_that_is_waited_for(estimator, options, ends):
     """Also of a refold that fails, after which the estimator is the old one again."""
-    stepped = Stepped()
-    stepped.put(readings(*series(100)))
+    stepped = Stepped().put(readings(*series(100)))
     engine = stepped.engine
     lock = Told(engine._lock, lambda: engine._requests.waiting or engine.estimator == engine._fold.estimator.name)
     engine.retune(estimator, engine.tuning.with_options(options))
@@ -493,8 +485,7 @@ def test_a_black_box_that_fails_loses_nothing_and_is_reported_once():
 
 def test_a_refold_over_a_black_box_that_fails_is_reported_too():
     solver = Solver()
-    stepped = Stepped(model=solved_by(solver.called), estimator="filterpy-ukf")
-    stepped.put(readings(*series(5)))
+    stepped = Stepped(model=solved_by(solver.called), estimator="filterpy-ukf").put(readings(*series(5)))
     solver.away = True
     stepped.submit(commands.SetTuning("Q.rate", 0.5))
     pull = pull_all(stepped.engine)

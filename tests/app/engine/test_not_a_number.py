@@ -80,8 +80,7 @@ def by_hand(model, estimator, *batches):
     made = twin()
     made.model, made.tuning, made.estimator = model, Tuning.of(model).with_options({}), estimator
     made.config.view = SimpleNamespace(window=60.0)
-    stepped = Stepped(of=made)
-    stepped.put(*batches)
+    stepped = Stepped(of=made).put(*batches)
     return stepped.engine
 
 

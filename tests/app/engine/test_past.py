@@ -73,8 +73,7 @@ def test_the_status_of_a_moment_of_a_large_field_is_that_of_its_rows(monkeypatch
 
 
 def test_an_edit_changes_the_estimate_of_a_moment():
-    stepped = Stepped()
-    stepped.put(readings(*walk(N)))
+    stepped = Stepped().put(readings(*walk(N)))
     at = 310 * SECOND
     before = stepped.engine.belief(at)
     stepped.submit(SetTuning("R.winding", 100.0))

@@ -42,8 +42,7 @@ def stubborn_twin(name):
 
 def stubborn(name):
     """Such a twin just before its reset."""
-    stepped = Stepped(of=stubborn_twin(name))
-    stepped.put(readings(T[:RESET_AT], Y[:RESET_AT]))
+    stepped = Stepped(of=stubborn_twin(name)).put(readings(T[:RESET_AT], Y[:RESET_AT]))
     return stepped
 
 

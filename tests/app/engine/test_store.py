@@ -17,7 +17,7 @@ from app.twin.twin import load_twin
 from app.web.readings import stored
 from app.web.running import OpenedTwin, RunningTwin
 from sources.source import ignore
-from tests.app.scripted import Replayed, Scripted, notice_texts, pull_all, random_walk, readings
+from tests.app.scripted import Replayed, Scripted, Stepped, pull_all, random_walk, readings
 from tests.benchmarks.kills import survive
 from tests.support import SECOND, assert_same, run_python
 from tests.waiting import wait_for
@@ -26,7 +26,7 @@ T0 = 1_700_000_000.0  # s; a live source has dates
 HEADER = 100  # bytes of an SQLite file, among them a count of its openings
 
 
-class Session:
+class Session(Stepped):
     """A running twin without threads, on a scripted source, and its store."""
 
     def __init__(self, path, source=None, twin=None, **options):
@@ -38,18 +38,6 @@ class Session:
         self.engine = self.running.engine
         self.engine.settle()
 
-    def put(self, *batches):
-        for batch in batches:
-            self.source.put(batch)
-            self.engine.settle()
-        return self
-
-    def submit(self, *commands):
-        for command in commands:
-            self.engine.submit(command)
-            self.engine.settle()
-        return self
-
     def write(self):
         """Write the store."""
         self.running.store.look()
@@ -59,9 +47,6 @@ class Session:
         """End as a killed process does: nothing more is written."""
         self.running.store._store.close()
         self.engine.stop()
-
-    def notices(self):
-        return notice_texts(self.engine)
 
 
 @pytest.fixture
@@ -109,7 +94,8 @@ def test_a_store_continues_bit_for_bit(tmp_path):
 
 def test_edits_runs_and_notes_are_continued(path):
     before = Session(path).put(walk(500))
-    before.submit(SetTuning("Q.temperature", 0.5), SetEstimator("ukf"), Note(1, "wide"), Annotate("pump on", T0 + 20.0))
+    before.submit(SetTuning("Q.temperature", 0.5)).submit(SetEstimator("ukf"))
+    before.submit(Note(1, "wide"), Annotate("pump on", T0 + 20.0))
     before.running.stop()
     after = Session(path)
     assert (after.engine.estimator, after.engine.tuning.get("Q.temperature")) == ("ukf", 0.5)

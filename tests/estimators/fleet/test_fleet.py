@@ -84,6 +84,14 @@ def add(target, event, *asset):
         target.add(what, *asset, t, values)
 
 
+def take(fleet, logs, arriving, a, count):
+    """Hand an asset's next events to the fleet and to its own log."""
+    for event in arriving[a][:count]:
+        add(fleet, event, a)
+        add(logs[a], event)
+    del arriving[a][:count]
+
+
 @cases(__file__, "gated_fleets.csv")
 @pytest.mark.parametrize("threads", [1, 3])
 def test_fleet_of_random_assets_has_the_bits_of_single_folds(estimator, name, gate, threads):
@@ -100,11 +108,7 @@ def test_fleet_of_random_assets_has_the_bits_of_single_folds(estimator, name, ga
     verdicts: set[int] = set()
     while any(arriving):
         for a in rng.permutation(12):
-            taken = int(rng.choice([0, 1, 1, 2, 9]))
-            for event in arriving[a][:taken]:
-                add(fleet, event, a)
-                add(logs[a], event)
-            del arriving[a][:taken]
+            take(fleet, logs, arriving, a, int(rng.choice([0, 1, 1, 2, 9])))
         fleet.advance()
         if rng.random() < 0.2 or not any(arriving):
             for a, log in enumerate(logs):
@@ -148,11 +152,7 @@ def test_decisions_on_rejected_sensors_are_those_of_single_folds(estimator, name
     outcomes: set[str] = set()
     while any(arriving):
         for a in range(count):
-            taken = int(rng.choice([0, 1, 2, 9, 60]))
-            for event in arriving[a][:taken]:
-                add(fleet, event, a)
-                add(logs[a], event)
-            del arriving[a][:taken]
+            take(fleet, logs, arriving, a, int(rng.choice([0, 1, 2, 9, 60])))
         fleet.advance()
         if rng.random() < 0.1 and threads > 1:
             former, fleet = fleet, Fleet(estimator, model, tunings, assets=count, policy=POLICY, recent=recent)
