@@ -232,7 +232,6 @@ def test_the_cause_is_that_of_an_episode_in_alarm_with_the_grade_of_the_twin(hea
 
 
 def test_rows_that_left_the_history_unseen_take_no_episode_along(engine, asset):
-    """One is over before them, one lasts beyond them."""
     longer = 1.0 + np.arange(9200), np.pad(asset[1], (0, 7400), "edge")
     engine.history, found = 2048, []
     for rows in np.split(np.arange(9200), [1700]):
