@@ -49,7 +49,7 @@ def running(
 
 def settled(engine: Any, revision: int = 0) -> None:
     """Wait until a revision runs, and no refold is under way."""
-    wait_for(lambda: engine.revisions.runs[-1].number >= revision and not engine.status().refolding)
+    wait_for(lambda: (status := engine.status()).revision >= revision and not status.refolding)
 
 
 def pixels(page: Any, selector: str, lower: float = 1.0) -> np.ndarray:

@@ -11,6 +11,7 @@ from app.engine.copies import Cursor
 from tests.app.twin.test_landmarks import LANDMARKS, folder  # noqa: F401  a fixture
 from tests.app.web.page.browsed import running, settled, until
 from tests.models import write_plant
+from tests.waiting import wait_for
 
 pytestmark = pytest.mark.browser
 
@@ -106,10 +107,9 @@ def test_landmarks_share_a_slider_and_a_switch(folder, visit):  # noqa: F811
         # Of the order of the recording's 0.01 m², and far from the 0.25 that were just set.
         assert found["R.sighting.range"].n > 300 and 0.003 < found["R.sighting.range"].variance < 0.03
         # Held out, all at once, and used again.
-        for number, used in ((2, False), (3, True)):
+        for used in (False, True):
             switches.locator("input").click()
-            settled(session.engine, number)
-            assert session.engine.status().tuning.used.tolist() == [used] * 3
+            wait_for(lambda used=used: session.engine.status().tuning.used.tolist() == [used] * 3)
             until(page, f"document.querySelector('label.sensor input').checked === {str(used).lower()}")
             if not used:
                 until(page, "document.querySelector('label.sensor em').textContent === 'held out'")
