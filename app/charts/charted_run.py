@@ -14,6 +14,7 @@ from estimators.track import estimated_rows
 
 from ..columns import Column, Rows
 from ..engine.copies import MAX_PULL_ROWS, Cursor, Pull
+from ..engine.history_copy import follow
 from ..engine.running_fold import Running
 from .levels_of_detail import FIRST, Groups, Pyramid, grouped
 
@@ -57,7 +58,7 @@ class KeptRows:
         """See `RowSource`; all rows at once, as they are not copied."""
         if cursor.log == 0:
             return self.rows(self._end, self._end)
-        cursor.log = 0
+        cursor.log, cursor.next = 0, self._end
         return replace(self.of, fresh=True, changed=self.of.first)
 
     def rows(self, start: int, stop: int) -> Pull:
@@ -110,8 +111,8 @@ class ChartedRun:
             self.close()
             self._cursor = self.source.cursor()
         self.changed = self.end
-        while True:
-            pull = self._taken(self.source.pull(self._cursor, MAX_PULL_ROWS, align=FIRST))
+        for rows in follow(self.source, self._cursor, align=FIRST):
+            pull = self._taken(rows)
             if pull.fresh:
                 self.levelled = sorted(columns)
                 self._pyramid = Pyramid(len(self.levelled))
@@ -121,9 +122,7 @@ class ChartedRun:
                 self._pyramid.update(pull.first, pull.events.t, self._values(pull, self.levelled))
                 self.changed = min(self.changed, pull.changed)
             self.end = pull.first + len(pull.events)
-            if len(pull.events) < MAX_PULL_ROWS:
-                self._pyramid.forget(pull.oldest)
-                return
+        self._pyramid.forget(pull.oldest)
 
     def span(self, since: int, until: int) -> tuple[int, int]:
         """Return absolute indices of the rows between two times, ns: the first, and the one after the last."""

@@ -22,8 +22,9 @@ from estimators.track import ADVISORY, DIVERGED, HEALTH_NAMES, TRACKING, WAITING
 
 from ..format_time import duration_text
 from ..leading import leading, severity
-from .copies import MAX_PULL_ROWS, Pull
+from .copies import Pull
 from .counts import last_run
+from .history_copy import follow
 from .jobs import Job
 from .running_fold import Running
 
@@ -144,12 +145,11 @@ class EpisodeLog:
 
     def _update(self) -> None:
         before, again = self._entries, False
-        while True:
-            log, passage = self._cursor.log, self._engine.notices.passage
-            pull = self._engine.pull(self._cursor, MAX_PULL_ROWS)
+        log, passage = self._cursor.log, self._engine.notices.passage
+        for pull in follow(self._engine, self._cursor):
             if not pull.fresh and pull.first < self.tracker.first:
                 # A late measurement belongs before the rows that are kept: pull all of them again.
-                self._cursor.revision = -1
+                self._cursor.revision, self._cursor.next = -1, -1
                 continue
             if pull.fresh:
                 passage = self._engine.notices.passage
@@ -163,8 +163,7 @@ class EpisodeLog:
                 self._earlier = tuple(_joined(self._earlier, self.tracker.entries))
                 self.tracker = self._new_tracker(pull)
             self.tracker.feed(pull.events, pull.track, pull.first)
-            if len(pull.events) < MAX_PULL_ROWS:
-                break
+            log = self._cursor.log
         tracker = self.tracker
         if tracker.n:
             self._entries = sorted([*tracker.entries, *self._others()], key=lambda entry: entry.episode.start)

@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterable, Iterator
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
 
@@ -51,7 +52,7 @@ def copy_rows(engine: Running) -> Pull | None:
     """Copy all rows; None while there are none."""
     cursor = engine.cursor()
     try:
-        found = pull_rest(engine, cursor, engine.pull(cursor, MAX_PULL_ROWS), MAX_PULL_ROWS)
+        found = joined(follow(engine, cursor), engine.model.width)
     finally:
         engine.release(cursor)
     return found if len(found.events) else None
@@ -63,19 +64,32 @@ def last_written(index: np.ndarray) -> np.ndarray:
     return np.append(index[:-1] < later[1:], np.ones(min(1, index.size), bool))
 
 
-def pull_rest(engine: Running, cursor: Cursor, pull: Pull, size: int) -> Pull:
-    """Return a fresh pull of `size` rows joined with all rows after it.
+def follow(source: Any, cursor: Cursor, size: int | None = None, *, align: int = 1) -> Iterator[Pull]:
+    """Pull from an engine, or what has the same rows, until none are left: at least once, `size` rows at a time.
+
+    Rows are pulled again if the cursor is moved back meanwhile. For `align` see `Running.pull`.
+    """
+    size = size or MAX_PULL_ROWS
+    while True:
+        pull = source.pull(cursor, size, align=align)
+        yield pull
+        if len(pull.events) < size and cursor.next == pull.first + len(pull.events):
+            return
+
+
+def joined(pulls: Iterable[Pull], width: int) -> Pull:
+    """Return the rows of several pulls, of which the first is fresh, as one; for `width` see `Events`.
 
     If another revision begins meanwhile its rows are returned; rows that a late measurement rewrote are the later ones.
     Notices are those of all pulls.
     """
-    parts, notices = [pull], list(pull.notices)
-    while len(parts[-1].events) == size:
-        more = engine.pull(cursor, size)
-        notices += more.notices
-        parts = [more] if more.fresh else [*parts, more]
+    parts: list[Pull] = []
+    notices = []
+    for pull in pulls:
+        notices += pull.notices
+        parts = [pull] if pull.fresh else [*parts, pull]
     first = parts[0].first
-    events = Events.concat([part.events for part in parts], engine.model.width)
+    events = Events.concat([part.events for part in parts], width)
     columns = zip(*(part.track for part in parts), strict=True)
     track = Track(*(np.concatenate(column) for column in columns))
     index = np.concatenate([part.first + np.arange(len(part.events)) for part in parts])

@@ -21,7 +21,7 @@ import rerun as rr
 
 from ..charts.colors import EITHER, Palette
 from ..engine.copies import MAX_PULL_ROWS, Pull
-from ..engine.history_copy import pull_rest
+from ..engine.history_copy import follow, joined
 from ..engine.notices import MAX_LINES
 from .rows import RerunRows
 from .sink import free_closed_streams
@@ -76,7 +76,7 @@ class RerunFeed:
             return self._read()
         pull = self._engine.pull(self._cursor, MAX_PULL_ROWS)
         if pull.fresh:
-            pull = pull_rest(self._engine, self._cursor, pull, MAX_PULL_ROWS)
+            pull = joined([pull, *follow(self._engine, self._cursor)], self._engine.model.width)
         self._notices.extend(pull.notices)
         if pull.fresh and self._rows is not None and not len(pull.events):
             # The source has just restarted: the charts stay as they are until there are rows.

@@ -10,7 +10,7 @@ import math
 import threading
 import time
 from collections import deque
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
 from types import SimpleNamespace
@@ -20,7 +20,8 @@ from estimators.diagnostics.health import MAX_ROWS_PER_READING
 from estimators.errors import NisusError, SourceError
 from sources.worker_process import gist
 
-from ..engine.copies import MAX_PULL_ROWS, Cursor, Pull
+from ..engine.copies import MAX_PULL_ROWS, Pull
+from ..engine.history_copy import follow
 from ..engine.jobs import LoopThread
 from ..engine.notices import Notice
 from ..format_time import counted
@@ -89,15 +90,13 @@ class Recorder:
         writing = self.writing
         return [*self.finished, *([] if writing is None or writing in self.finished else [writing])]
 
-    def start(self) -> None:
-        """Start the thread, which waits for `record`."""
-        self._thread.start()
-
     def record(self, path: Path | None) -> None:
         """Record into a new file, history included; None finishes the current one."""
         self._wanted = path
         self._asked.append(path)
         self._wake.set()
+        if path is not None and not self._thread.is_alive():
+            self._thread.start()
 
     def stop(self) -> None:
         """Finish the file and end the thread."""
@@ -242,7 +241,7 @@ class RecordingPart:
             self._write_events()
         if last or time.monotonic() - self._drawn >= CHARTS_PERIOD_S:
             self._drawn = time.monotonic()
-            for pull in self._pulls(self._charts):
+            for pull in follow(self._engine, self._charts):
                 if pull.fresh:
                     self._drawn_from, self._edited = pull.first, False
                 self._drawing(replace(pull, fresh=pull.fresh or self._undrawn))
@@ -258,7 +257,7 @@ class RecordingPart:
         return large or over or time.monotonic() - self._begun >= split.seconds
 
     def _write_events(self) -> None:
-        for pull in self._pulls(self._events):
+        for pull in follow(self._engine, self._events):
             begun = self._revision >= 0
             if pull.fresh:
                 self._start, base = self._engine.origin(pull.first)
@@ -295,20 +294,13 @@ class RecordingPart:
             self._events.next = start
         self._start, self._base = start, base
 
-    def _pulls(self, cursor: Cursor) -> Iterator[Pull]:
-        while True:
-            pull = self._engine.pull(cursor, MAX_PULL_ROWS)
-            yield pull
-            if len(pull.events) < MAX_PULL_ROWS and cursor.next == pull.first + len(pull.events):
-                return
-
     def end(self, *, short: bool = False) -> None:
         """Write the rest and close; after an edit with the charts of the last revision, if the disk has room."""
         self.write(last=True)
         if self._edited and not short:
             again = replace(self._charts, next=self._drawn_from, picture=-1)
             fresh = True
-            for pull in self._pulls(again):
+            for pull in follow(self._engine, again):
                 self._drawing(replace(pull, fresh=fresh, notices=[]))
                 self.file.flush()
                 fresh = False

@@ -13,6 +13,7 @@ from estimators.diagnostics.references import shown_track
 
 from ..charts.colors import THEMES
 from ..engine.copies import MAX_PULL_ROWS
+from ..engine.history_copy import follow
 from ..engine.jobs import LoopThread
 from ..engine.running_fold import Running
 from .guarded_server import addresses, guarded_server, unprinted, when_connected
@@ -105,12 +106,10 @@ class ViserView:
     def _pull(self) -> bool:
         """Take new rows; return whether there were any."""
         changed = False
-        while True:
-            pull = self.engine.pull(self._cursor, self._rows)
+        for pull in follow(self.engine, self._cursor, self._rows):
             changed |= bool(len(pull.events)) or pull.fresh
             self._take(pull)
-            if len(pull.events) < self._rows:
-                return changed
+        return changed
 
     def _take(self, pull: Any) -> None:
         if isinstance(self.stage.scene, FIELD_SCENES):

@@ -178,7 +178,6 @@ class RunningTwin:
 
     def start(self) -> None:
         """Start everything."""
-        self.recorder.start()
         if self.server is not None:
             self.view.start()
             self.gone = self.server.start()

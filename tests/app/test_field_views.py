@@ -91,7 +91,6 @@ class Running:
         self.recorder = self.engine.recorder = Recorder(
             self.engine, lambda stream: RerunRows(stream, self.engine, series=None)
         )
-        self.recorder.start()
         self.engine.start()
         self.put(batches)
 

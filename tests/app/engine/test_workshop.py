@@ -173,7 +173,6 @@ def test_a_late_reading_reaches_the_first_fold_that_was_begun_without_it():
 def test_a_recording_that_begins_before_the_first_filter_holds_all_of_it(started, tmp_path):
     engine, source = started(kf=1)
     recorder = engine.recorder = Recorder(engine, lambda stream: lambda pull: None)
-    recorder.start()
     times, values = series(120)
     source.put(readings(times[:60], values[:60]))
     wait_for(lambda: engine.span()[1] == round(times[59] * 1e9))

@@ -52,7 +52,6 @@ def start(monkeypatch):
         source, drawn = Scripted(), []
         engine = Engine(twin(estimator=estimator, **options), lambda report: source)
         engine.recorder = Recorder(engine, lambda stream: drawn.append, split)
-        engine.recorder.start()
         engine.start()
         running.append(engine)
         return source, engine, drawn

@@ -41,7 +41,6 @@ def running():
     source = Scripted()
     engine = Engine(twin(), lambda report: source)
     recorder = engine.recorder = Recorder(engine, drawn)
-    recorder.start()
     engine.start()
     yield source, engine, recorder
     engine.stop()
@@ -97,7 +96,6 @@ def test_a_recording_is_listed_from_when_it_is_asked_for_until_it_is_finished(tm
     going_on, source = threading.Event(), Scripted()
     engine = Engine(twin(), lambda report: source)
     recorder = engine.recorder = Recorder(engine, lambda stream: going_on.wait(LIMIT_S) and drawn(stream))
-    recorder.start()
     engine.start()
     first, second = tmp_path / "first.rrd", tmp_path / "second.rrd"
     try:
@@ -178,7 +176,6 @@ def written(part, **last):
     print(folded, flush=True)
 RecordingPart.write = written
 engine.recorder = Recorder(engine, lambda stream: lambda pull: None)
-engine.recorder.start()
 engine.start()
 engine.submit(commands.Record(Path({path!r})))
 k = 0
