@@ -180,5 +180,5 @@ def open_session(
         gallery = Gallery(session, opener, first=wanted, own=own)
         if page.overview is None:
             GalleryApi(gallery, Recordings(recordings, lambda: session.recorded))
-        session.threads.append(SavedFiles(gallery))
+        session.starts = partial(SavedFiles, gallery)
     return session

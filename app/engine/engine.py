@@ -36,7 +36,7 @@ from .batches import BatchSizer
 from .copies import LogTail, Status
 from .execute import execute
 from .feeder import Delivery, Feeder
-from .jobs import Job, Jobs, run_all
+from .jobs import Job, Jobs, LoopThread, run_all
 from .outcomes import Outcomes
 from .running_fold import Keeper, Records, Running, StoredTwin
 from .status import busy_status, past_status, status_of
@@ -62,6 +62,9 @@ GESTURE_REFOLD_S = 1.0
 
 CATCH_UP_S = 0.1
 """Seconds for which a refold catches up in the engine's thread, which does nothing else meanwhile."""
+
+WATCH_PERIOD_S = 0.5
+"""Seconds between two looks for a fold that does not return."""
 
 STATUS_PERIOD_S = 0.1
 """Seconds for which a status is reused."""
@@ -129,6 +132,7 @@ class Engine(Running):
         self._refolds = Jobs(self.notices, "refold", threads=1, niceness=0)
         # A long history may take minutes: only a function that does not return ends a refold.
         self._refold_watchdog = Watchdog(self._give_up, then=REFOLD_REMEDY, long=math.inf)
+        self._watching = LoopThread(self._watch, "watchdog")
         self.reloads = 0
         self._stopping = threading.Event()
         self._finished = False
@@ -181,8 +185,7 @@ class Engine(Running):
 
     def start(self) -> None:
         """Begin to read and fold."""
-        watchdogs = self._watchdog, self._refold_watchdog
-        for part in (*watchdogs, self._refolds, self._thread, self._feeder, self._watchers, self.jobs):
+        for part in (self._watching, self._refolds, self._thread, self._feeder, self._watchers, self.jobs):
             part.start()
         if self._awaited is not None:
             self._inbox.put(partial(self._compiled, self._awaited))
@@ -192,8 +195,7 @@ class Engine(Running):
         self._stopping.set()
         run_all(self._join, self._feeder.stop, self._workshop.stop, self._refolds.stop, self.jobs.stop)
         self._watchers.episode_log.stop()
-        self._watchdog.stop()
-        self._refold_watchdog.stop()
+        self._watching.stopping.set()
 
     def _join(self) -> None:
         """Wait for the batch that is being folded."""
@@ -255,7 +257,8 @@ class Engine(Running):
                 # A refold counts as waiting until the revision that came of it is shown.
                 fields = self._known_fields(self._requests.waiting or last[1].revision != self._revision)
                 status = busy_status(last[1], fields, self._watchdog.busy)
-        self._status = (time.monotonic(), status)
+        if self._status is last:  # what was asked for meanwhile is not in this one
+            self._status = (time.monotonic(), status)
         return self._with_lag(status)
 
     def _with_lag(self, status: Status) -> Status:
@@ -438,6 +441,11 @@ class Engine(Running):
         now = self._idle_ticks.asks(self._feeder.source, int(self._log.t[self._log.n - 1]))
         if now is not None:
             self.insert(Events.one(now, time.time_ns(), TICK, 0, [], self.model.width))
+
+    def _watch(self) -> None:
+        while not self._watching.stopping.wait(WATCH_PERIOD_S):
+            self._watchdog.look()
+            self._refold_watchdog.look()
 
     def _report_stalled(self, text: str, level: str) -> None:
         self.notices.say(text, level=level)

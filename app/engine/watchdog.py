@@ -21,7 +21,7 @@ from estimators.model.state_space import StateSpaceModel
 from estimators.numerics.jit import plain
 
 from ..terminal import complain
-from .jobs import LoopThread, start_in_thread
+from .jobs import start_in_thread
 
 if TYPE_CHECKING:
     from estimators.fold import Fold
@@ -118,15 +118,6 @@ class Watchdog:
         self._asked: tuple[float, Fold] | None = None
         self.text: str | None = None
         """Line about the fold that does not return; None while all is well."""
-        self._thread = LoopThread(self._run, "stall")
-
-    def start(self) -> None:
-        """Watch until `stop`."""
-        self._thread.start()
-
-    def stop(self) -> None:
-        """Stop watching."""
-        self._thread.stopping.set()
 
     @property
     def busy(self) -> float:
@@ -142,10 +133,6 @@ class Watchdog:
             yield
         finally:
             self._work = None
-
-    def _run(self) -> None:
-        while not self._thread.stopping.wait(0.5):
-            self.look()
 
     def look(self) -> None:
         """Look once at the duration of the present fold."""

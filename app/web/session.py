@@ -21,7 +21,7 @@ from typing import TYPE_CHECKING
 from estimators.errors import SourceError
 
 from ..engine.commands import Record
-from ..engine.jobs import LoopThread, run_all
+from ..engine.jobs import run_all
 from ..record.rrd_file import NEVER, Split
 from ..terminal import complain, until_asked_to_end
 from .door import Door
@@ -140,8 +140,8 @@ class Session:
         self._recorded: list[Path] = []
         self._notes: dict[object, tuple[Annotation, ...]] = {}
         """Notes of users on the twins that ran before, by twin and log."""
-        self.threads: list[LoopThread] = []
-        """Threads that start and stop with the session."""
+        self.starts: Callable[[RunningTwin], object] = lambda running: None
+        """Called with each twin that is about to start."""
         if page is not None:
             self.door = Door(page.port, page.grants, public=page.public, overview=page.overview, site=page.site)
         try:
@@ -224,6 +224,7 @@ class Session:
                     self.running = after
                     del before
                 if after is not None:
+                    self.starts(after)
                     after.start()
                     _settle(after.gone, left)
                 elif stopped and self.door is not None:
@@ -234,15 +235,12 @@ class Session:
         if self.door is not None:
             self.door.start()
         if self.running is not None:
+            self.starts(self.running)
             self.running.start()
         _settle()
-        for item in self.threads:
-            item.start()
 
     def stop(self) -> None:
         """Stop everything; a recording is finished."""
-        for item in self.threads:
-            item.stop(2.0)
         with self._changing:
             ends = [item.stop for item in (self.running, self.door) if item is not None]
             run_all(*ends)

@@ -98,13 +98,13 @@ class Publisher:
     def start(self) -> None:
         """Connect and begin to publish."""
         self._begin()
-        self._thread.start()
+        self._engine.grown |= {self._awake}
 
     def stop(self) -> None:
         """Disconnect."""
         self._thread.stopping.set()
         self._grown.set()
-        self._engine.grown -= {self._grown.set}
+        self._engine.grown -= {self._awake}
         self._thread.stop(2.0)
         self._end()
         self._store.close(self._parts.rules, self._parts.deliveries)
@@ -150,8 +150,6 @@ class Publisher:
         parts = self._parts
         for output in parts.outputs:
             self._guarded(output, output.start)
-        if parts.outputs:
-            self._engine.grown |= {self._grown.set}
         if parts.deliveries.queues:
             self.problem = self._store.open(parts.rules, parts.deliveries)
             parts.jobs.run("alerts", lambda job: self._look(parts), every=RULES_PERIOD_S)
@@ -162,6 +160,13 @@ class Publisher:
         self._parts.jobs.stop()
         for output in self._parts.outputs:
             self._guarded(output, output.stop)
+
+    def _awake(self) -> None:
+        """Wake the thread, which begins with the first output or another YAML; on the engine's thread."""
+        if self._parts.outputs or self._engine.twin.config is not self._parts.config:
+            if not self._thread.is_alive():
+                self._thread.start()
+            self._grown.set()
 
     def _run(self) -> None:
         sent, at = None, -np.inf
@@ -186,6 +191,7 @@ class Publisher:
         """Begin again with the outputs of the YAML that was saved meanwhile."""
         config, old = self._engine.twin.config, self._parts.config
         if (config.outputs, config.alerts) == (old.outputs, old.alerts):
+            self._parts = self._parts._replace(config=config)
             return
         try:
             parts = self._make()
@@ -194,7 +200,6 @@ class Publisher:
             self._parts = self._parts._replace(config=config)
             return
         self._end()
-        self._engine.grown -= {self._grown.set}
         before = self._parts
         parts.rules.restore(before.rules.state(), 0.0)
         parts.deliveries.restore(before.deliveries.waiting())

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import threading
 import time
-import weakref
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -14,10 +13,10 @@ from config.loader import shipped, shown_path
 from config.tunings import OWN_VALUES
 from estimators.errors import ConfigError, NisusError, nearest, quoted
 
-from ...engine.jobs import LoopThread
+from ...engine.jobs import Job
 from ...twin.changes import obstacle
 from ...twin.twin import VERSION, Twin, with_version
-from ..running import OpenedTwin, RunningTwin, Stamp, stamp_of
+from ..running import OpenedTwin, RunningTwin, stamp_of
 from ..session import Session
 
 
@@ -174,33 +173,26 @@ FILE_POLL_PERIOD_S = 0.4
 """Between two looks at the files. An editor may write in pieces: a file is read once it is unchanged."""
 
 
-class SavedFiles(LoopThread):
-    """Watches the files of the running twin, in a thread of its own."""
+class SavedFiles:
+    """Watches the files of a running twin, in a repeated job."""
 
-    def __init__(self, gallery: Gallery) -> None:
-        super().__init__(self._poll, "saved files")
-        self._gallery = gallery
-        # A weak reference does not keep it alive.
-        self._of: weakref.ref[RunningTwin] | None = None
-        self._files: tuple[Path, ...] = ()
-        self._known: Stamp = ()
-        self._seen: Stamp = ()
+    def __init__(self, gallery: Gallery, running: RunningTwin) -> None:
+        self._gallery, self._running = gallery, running
+        self._files = running.opening.files
+        self._known = self._seen = running.opening.stamp
+        if running.opening.again is not None:
+            running.engine.jobs.run("saved files", self.look, every=FILE_POLL_PERIOD_S)
 
-    def look(self) -> None:
+    def look(self, job: Job | None = None) -> None:
         """Look once; reload when a file has changed since it was read, but not since the last look."""
-        running = self._gallery.session.running
-        if running is None or running.opening.again is None:
-            self._of = None
-            return
-        if self._of is None or running is not self._of():
-            self._of, self._files = weakref.ref(running), running.opening.files
-            self._known = self._seen = running.opening.stamp
+        running, again = self._running, self._running.opening.again
+        assert again is not None
         stamp = stamp_of(self._files)
         settled, self._seen = stamp == self._seen, stamp
         if settled and stamp != self._known and self._gallery.starting is None:
             changed = [file for file, was, now in zip(self._files, self._known, stamp, strict=True) if was != now]
             self._known = stamp
-            self._read(running, ", ".join(shown_path(file) for file in changed), running.opening.again)
+            self._read(running, ", ".join(shown_path(file) for file in changed), again)
 
     def _watch(self, files: tuple[Path, ...]) -> None:
         """Watch these files, from which the twin was just read."""
@@ -238,12 +230,3 @@ class SavedFiles(LoopThread):
     def _refuse(self, running: RunningTwin, text: str) -> None:
         running.server.unread = text
         running.engine.notices.say(f"not read again: {text}", level="error")
-
-    def _poll(self) -> None:
-        while not self.stopping.wait(FILE_POLL_PERIOD_S):
-            try:
-                self.look()
-            except NisusError as error:
-                running = self._gallery.session.running
-                if running is not None:
-                    running.engine.notices.say(str(error), level="warn")

@@ -230,9 +230,7 @@ def test_a_file_is_read_once_it_stays_as_it_is(pump):
     running.opening.files, running.opening.stamp = (pump,), stamp_of((pump,))
     running.opening.again = lambda: read.append(pump.read_text()) or load_twin(pump)
     running.engine.twin = load_twin(pump)
-    gallery = Mock(starting=None)
-    gallery.session.running = running
-    files = SavedFiles(gallery)
+    files = SavedFiles(Mock(starting=None), running)
     files.look()
     save(pump, YAML + "#")
     files.look()
