@@ -10,7 +10,6 @@ import asyncio
 import contextlib
 import errno
 import functools
-import json
 import os
 import secrets
 import socket
@@ -24,6 +23,7 @@ from typing import Any, Protocol
 
 import h11
 import uvicorn
+from anyio import to_thread
 from starlette.applications import Starlette
 from starlette.datastructures import QueryParams
 from starlette.requests import Request
@@ -37,7 +37,8 @@ from estimators.errors import ConfigError
 
 from ..engine.jobs import LoopThread
 from .gate import SESSION, USER, Gate, Grant, User, changes, with_security_headers
-from .http import MAX_BODY_BYTES
+from .http import PARSED_BODY
+from .request_threads import REQUEST_THREADS
 
 SERVICE_RESTART = 1012
 """Close code of a WebSocket whose application is replaced."""
@@ -338,30 +339,20 @@ class Door:
 
 
 async def _audited(audit: Auditor, application: ASGIApp, scope: Scope, receive: Receive, send: Send) -> None:
-    """Serve a request, and note it if it was carried out; of its body only an object in JSON."""
-    body = bytearray()
+    """Serve a request, and note it if it was carried out; of its body only an object that a route has parsed."""
     # By the time of the answer the history may have been folded again with what it changed.
     revision = audit.revision()
 
-    async def receive_and_keep() -> Message:
-        message = await receive()
-        if len(body) <= MAX_BODY_BYTES:
-            body.extend(message.get("body", b""))
-        return message
-
     async def send_and_note(message: Message) -> None:
         if message["type"] == "http.response.start" and message["status"] < 400:
-            try:
-                found = json.loads(bytes(body))
-            except (ValueError, RecursionError):
-                found = None
+            found, size = scope.get(PARSED_BODY, (None, 0))
             fields = found if isinstance(found, dict) else dict(QueryParams(scope["query_string"]))
-            if len(body) > MAX_NOTED_BYTES:
-                fields = {"command": fields.get("command"), "bytes": len(body)}
+            if size > MAX_NOTED_BYTES:
+                fields = {"command": fields.get("command"), "bytes": size}
             audit.add(scope.get(USER) or User(SESSION, "", ""), scope["path"], fields, revision)
         await send(message)
 
-    await application(scope, receive_and_keep, send_and_note)
+    await application(scope, receive, send_and_note)
 
 
 async def _alive(request: Request) -> PlainTextResponse:
@@ -377,6 +368,7 @@ class PageServer(uvicorn.Server):
     async def main_loop(self) -> None:
         """Serve until `end` is called."""
         ended, loop = asyncio.Event(), asyncio.get_running_loop()
+        to_thread.current_default_thread_limiter().total_tokens = REQUEST_THREADS
         self._end = functools.partial(loop.call_soon_threadsafe, ended.set)
         while not await self.on_tick(0):  # 0: with the date of the answers
             with contextlib.suppress(TimeoutError):

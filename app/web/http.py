@@ -32,6 +32,9 @@ Runner = Callable[[Callable[[], Any]], Awaitable[Any]]
 PAGE = Path(__file__).parent / "page"
 """Folder of the page's HTML, CSS and JavaScript."""
 
+PARSED_BODY = "nisus.body"
+"""Key of a request's parsed body, and its bytes, in its scope: for the audit log."""
+
 MAX_BODY_BYTES = 64 * 1024
 """Longest request body, and longest message of a browser on a stream; a command takes a hundred bytes."""
 
@@ -165,13 +168,15 @@ def post(
         if request.headers.get("content-type", "").partition(";")[0].strip() != "application/json":
             return PlainTextResponse("Nisus: Content-Type must be application/json.\n", 415)
         try:
-            body = json.loads(await bounded_body(request))
+            text = await bounded_body(request)
+            body = json.loads(text)
         except TooLarge as error:
             return PlainTextResponse(f"Nisus: {error}.\n", 413)
         except ConfigError as error:
             return refusal(error)
         except (ValueError, RecursionError):
             return Json({"error": "the body is no JSON, or holds a number or a nesting that is too large"}, 400)
+        request.scope[PARSED_BODY] = body, len(text)
         subject = request.url.path.removeprefix("/api/")
 
         def call() -> Any:

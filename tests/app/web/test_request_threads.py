@@ -1,49 +1,53 @@
-"""Threads of requests: as many as stated from the first request on, results, errors, cancelled requests."""
+"""Threads of requests: their number, results, errors, cancelled requests."""
 
 import asyncio
+import socket
 import threading
+from contextlib import ExitStack
 from unittest.mock import AsyncMock
 
 import pytest
+from starlette.responses import PlainTextResponse
 
 from app.charts.series import Series
-from app.web.request_threads import RequestThreads
+from app.web.door import Door
+from app.web.request_threads import REQUEST_THREADS, in_thread
 from app.web.streams import PageStream
 from tests.app.scripted import Stepped, notice_texts
-from tests.waiting import LIMIT_S
+from tests.waiting import LIMIT_S, wait_for
 
 
-def started_by(act):
-    before = set(threading.enumerate())
-    result = act()
-    return result, set(threading.enumerate()) - before
-
-
-def test_all_threads_start_with_the_first_request_and_none_with_more():
-    threads, go_on = RequestThreads("test", 4), threading.Event()
-    first, started = started_by(lambda: threads.submit(lambda: 7))
-    assert first.result(LIMIT_S) == 7 and len(started) == 4
-    busy = threading.Barrier(5)
+def test_requests_share_the_stated_number_of_threads():
+    served, go_on, at_work = Door(0), threading.Event(), []
 
     def wait():
-        busy.wait(LIMIT_S)
+        at_work.append(threading.current_thread())
         go_on.wait(LIMIT_S)
-        return threading.current_thread()
+        if len(at_work) == 7:
+            raise ValueError("the seventh")
+        return PlainTextResponse("here")
 
-    outcomes, more = started_by(lambda: [threads.submit(wait) for _ in range(4)])
-    busy.wait(LIMIT_S)  # all four are at work
-    queued, further = started_by(lambda: [threads.submit(threading.current_thread) for _ in range(20)])
-    assert not more and not further and not any(item.done() for item in queued)
-    go_on.set()
-    assert {item.result(LIMIT_S) for item in outcomes + queued} == started
+    async def answer(scope, receive, send):
+        try:
+            found = await in_thread(wait)
+        except ValueError as error:
+            found = PlainTextResponse(str(error))
+        await found(scope, receive, send)
 
-
-def test_an_error_is_the_request_s_and_the_thread_goes_on():
-    threads = RequestThreads("test", 1)
-    failed = threads.submit(lambda: 1 / 0)
-    with pytest.raises(ZeroDivisionError):
-        failed.result(LIMIT_S)
-    assert threads.submit(lambda: 3).result(LIMIT_S) == 3
+    served.show(answer)
+    served.start()
+    with ExitStack() as ends:
+        ends.callback(served.stop)
+        ends.callback(go_on.set)
+        head = f"GET /api/x HTTP/1.1\r\nHost: 127.0.0.1\r\nAuthorization: Bearer {served.token}\r\n"
+        asked = []
+        for _ in range(REQUEST_THREADS + 3):
+            asked.append(ends.enter_context(socket.create_connection(("127.0.0.1", served.port), LIMIT_S)))
+            asked[-1].sendall(f"{head}Connection: close\r\n\r\n".encode())
+        wait_for(lambda: len(at_work) == REQUEST_THREADS)
+        go_on.set()
+        answers = [one.makefile("rb").read().rpartition(b"\r\n")[2] for one in asked]
+        assert sorted(set(answers)) == [b"here", b"the seventh"] and len(set(at_work)) == REQUEST_THREADS
 
 
 def test_a_cancelled_request_ends_after_its_work():
@@ -55,7 +59,7 @@ def test_a_cancelled_request_ends_after_its_work():
             go_on.wait(LIMIT_S)
             done.append(word + more)
 
-        task = asyncio.ensure_future(RequestThreads("test", 2).run(work, "a", more="b"))
+        task = asyncio.ensure_future(in_thread(work, "a", more="b"))
         assert await asyncio.to_thread(begun.wait, LIMIT_S)
         task.cancel()
         asyncio.get_running_loop().call_later(0.05, go_on.set)
