@@ -21,6 +21,15 @@ export function setText(node, text) {
   if (node.textContent !== text) node.textContent = text;
 }
 
+// The text of a node that is hidden while it has none.
+export function showText(node, text) {
+  setText(node, text ?? "");
+  node.hidden = !text;
+}
+
+// A line for the reason why something was refused.
+export const refusal = () => element("p", { class: "error", role: "alert", hidden: true });
+
 export function setAttribute(node, name, value) {
   if (value === null || value === false) {
     if (node.hasAttribute(name)) node.removeAttribute(name);

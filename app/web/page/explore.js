@@ -1,6 +1,6 @@
 // Explore: Rerun's viewer in a tab, started when it is first shown, asleep while it is hidden.
 
-import { $, setText } from "./dom.js";
+import { $, showText } from "./dom.js";
 import { span } from "./format.js";
 import { ExploreStream, FOLLOWING, PAUSED, setTimeCursor, Viewer } from "./rerun.js";
 
@@ -27,7 +27,7 @@ export class Explore {
       this.time = window.nisus.exploreTime = new ExploreTime(this.viewer, this.page);
       this.time.wake();
     } catch (error) {
-      this.note(`Rerun could not be loaded: ${error.message}`);
+      showText($("notice"), `Rerun could not be loaded: ${error.message}`);
       this.starting = false;
     }
   }
@@ -53,14 +53,8 @@ export class Explore {
     const late = drawn !== null && drawn !== undefined && newest !== null && drawn !== newest;
     const lag = this.time?.lag ?? 0;
     const text = late ? `Rerun still shows revision ${drawn}; drawing ${newest} …` : lag > MAX_LAG_S ? `Rerun is ${span(lag)} behind` : "";
-    setText($("behind"), text);
-    $("behind").hidden = !text;
-    if (message.failed) this.note(`Rerun stopped: ${message.failed}. Reload the page.`);
-  }
-
-  note(text) {
-    setText($("notice"), text);
-    $("notice").hidden = false;
+    showText($("behind"), text);
+    if (message.failed) showText($("notice"), `Rerun stopped: ${message.failed}. Reload the page.`);
   }
 }
 

@@ -1,6 +1,6 @@
 // Faults on demand and maintenance: put something wrong into what the source says, and see how soon the twin tells.
 
-import { element, setText } from "./dom.js";
+import { element, refusal, setText, showText } from "./dom.js";
 import { spaced, words } from "./format.js";
 import { section } from "./tune.js";
 
@@ -29,7 +29,7 @@ export class Faults {
     this.other = element("select", { "aria-label": "Swapped with" });
     this.help = element("p", { class: "about" });
     this.numbers = element("div", { class: "numbers" });
-    this.note = element("p", { class: "error", role: "alert", hidden: true });
+    this.note = refusal();
     this.list = element("ul", { class: "held" });
     const inject = element("button", { type: "button", id: "inject", class: "go", onclick: () => this.inject() }, "Inject");
     const made = section("Faults on demand", hint, false, element("div", { class: "pair" }, this.kind, this.target),
@@ -91,12 +91,7 @@ export class Faults {
       const text = field.value.trim().replace(",", ".");
       if (text !== "") fields[name] = Number.isFinite(Number(text)) ? Number(text) : text;
     }
-    this.complain(await this.link.ask("InjectFault", fields));
-  }
-
-  complain(reason) {
-    setText(this.note, reason ?? "");
-    this.note.hidden = !reason;
+    showText(this.note, await this.link.ask("InjectFault", fields));
   }
 
   show(status) {
@@ -115,12 +110,11 @@ export class Faults {
   maintenanceSection() {
     const what = element("input", { type: "text", placeholder: "changed part", "aria-label": "Changed part", maxlength: 200 });
     const which = element("select", { "aria-label": "States concerned" }, element("option", { value: "" }, "all states"), ...this.model.states.map((state) => element("option", { value: state.name }, words(state.name))));
-    const note = element("p", { class: "error", role: "alert", hidden: true });
+    const note = refusal();
     const done = async () => {
       const states = which.value ? [which.value] : this.model.states.map((state) => state.name);
       const reason = await this.link.ask("Maintenance", { what: what.value.trim(), states });
-      setText(note, reason ?? "");
-      note.hidden = !reason;
+      showText(note, reason);
       if (!reason) what.value = "";
     };
     const reset = element("button", { type: "button", id: "reset", title: "Restart the estimate from the prior", onclick: () => this.link.ask("Reset") }, "Reset the estimate");

@@ -2,7 +2,7 @@
 // on held-out data.
 
 import { Panel } from "./controls.js";
-import { element, setText } from "./dom.js";
+import { element, refusal, setText, showText } from "./dom.js";
 import { clock, compact, count, spaced, span, words } from "./format.js";
 import { post } from "./http.js";
 
@@ -20,7 +20,7 @@ export class Fit {
     tune.restoreButton.before(this.button);
     this.form = element("div", { class: "form" });
     this.progress = element("div", { class: "progress", role: "status", hidden: true });
-    this.error = element("p", { class: "error", role: "alert", hidden: true });
+    this.error = refusal();
     this.result = element("div", { class: "result" });
     const opened = () => {
       if (this.estimator !== link.status.estimator) this.offer();
@@ -63,14 +63,9 @@ export class Fit {
   async ask(method, body) {
     clearTimeout(this.timer);
     const told = await post("api/fit", body, method);
-    this.say(told.error ?? "");
+    showText(this.error, told.error);
     if (!told.error) this.take(told);
     else if (BUSY.includes(this.told?.state)) this.timer = setTimeout(() => this.ask("GET"), 10 * FIT_PERIOD);
-  }
-
-  say(reason) {
-    setText(this.error, reason);
-    this.error.hidden = !reason;
   }
 
   take(told) {
@@ -96,7 +91,7 @@ export class Fit {
       setText(this.best, told.gain > 0 ? `Best so far: +${compact(told.gain, 3)} on the fitted blocks (${told.best})` : "No better values yet.");
       this.timer = setTimeout(() => this.ask("GET"), FIT_PERIOD);
     }
-    if (told.state === "failed") this.say(told.reason);
+    if (told.state === "failed") showText(this.error, told.reason);
     const key = `${told.number}/${told.state}/${told.current}`;
     if (key === this.key) return;
     [this.key, this.told] = [key, told];
@@ -128,7 +123,7 @@ export class Fit {
     const keep = async () => {
       const note = `fitted: ${told.wanted.join(", ")}`;
       const { error = "" } = await post("api/fit/keep", { name: name.value.trim(), note });
-      this.say(error);
+      showText(this.error, error);
       setText(kept, error ? "" : `kept as ${name.value.trim()}, see Runs`);
     };
     const kept = element("span", { class: "faint", role: "status" });
@@ -136,7 +131,7 @@ export class Fit {
   }
 
   async use(told) {
-    this.say((await this.tune.edit("SetTunings", { values: told.values })) ?? "");
+    showText(this.error, await this.tune.edit("SetTunings", { values: told.values }));
   }
 }
 
@@ -241,7 +236,7 @@ export class Refit {
     this.said = element("span", { class: "faint", role: "status" });
     this.button = element("button", { type: "button", id: "refit-open", title: "All fits with their evidence" }, "Fits…");
     this.offer = element("div", {});
-    this.error = element("p", { class: "error", role: "alert", hidden: true });
+    this.error = refusal();
     const head = element("div", { class: "refit-head" }, element("h3", { title: "Parameters are fitted to the latest measurements at set times" }, "Dual estimation"), this.said, element("span", { class: "space" }), this.button);
     this.card = element("section", { id: "refit", "aria-label": "Dual estimation", hidden: true }, head, this.offer, this.error);
     tune.sections.before(this.card);
@@ -266,9 +261,7 @@ export class Refit {
 
   // Says why where it is refused.
   async post(path, fields) {
-    const { error = "" } = await post(path, fields);
-    setText(this.error, error);
-    this.error.hidden = !error;
+    showText(this.error, (await post(path, fields)).error);
     await this.look();
   }
 
@@ -328,7 +321,7 @@ export class Advice {
     this.stop = element("button", { type: "button", id: "advice-cancel", class: "go", hidden: true, onclick: () => this.ask("DELETE") }, "Cancel");
     this.bar = element("progress", { max: 1, hidden: true, "aria-label": "Share of the questions answered" });
     this.said = element("span", { class: "faint", role: "status" });
-    this.error = element("p", { class: "error", role: "alert", hidden: true });
+    this.error = refusal();
     this.cards = element("div", { class: "claims" });
     this.panel = new Panel(this.button, "advice-panel", "Which estimator, and why", () => this.ask("GET"),
       element("div", { class: "progress" }, this.measure, this.bar, this.said, this.stop), this.error, this.cards);
@@ -341,7 +334,7 @@ export class Advice {
   async ask(method) {
     clearTimeout(this.timer);
     const told = await post("api/advice", method === "POST" ? {} : undefined, method);
-    this.say(told.error ?? told.reason);
+    showText(this.error, told.error ?? told.reason);
     if (told.error) return;
     const busy = BUSY.includes(told.state);
     if (busy) this.timer = setTimeout(() => this.ask("GET"), ADVICE_PERIOD);
@@ -357,11 +350,6 @@ export class Advice {
     this.key = key;
     this.told = told;
     this.cards.replaceChildren(...(told.advice ? [this.recommended(told), this.excluded(told.advice), ...told.advice.claims.map((claim) => this.claim(claim, told.advice.because))].filter(Boolean) : []));
-  }
-
-  say(reason) {
-    setText(this.error, reason ?? "");
-    this.error.hidden = !reason;
   }
 
   recommended({ advice }) {
@@ -390,7 +378,7 @@ export class Advice {
   }
 
   async apply(advice) {
-    this.say(await this.tune.edit("SetEstimator", { name: advice.estimator, options: advice.options }));
+    showText(this.error, await this.tune.edit("SetEstimator", { name: advice.estimator, options: advice.options }));
     // Its card is about to be another.
     this.measure.focus();
   }

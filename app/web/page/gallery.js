@@ -2,7 +2,7 @@
 // signals instead.
 
 import { keys } from "./controls.js";
-import { $, element, setAttribute, setText } from "./dom.js";
+import { $, element, setAttribute, setText, showText } from "./dom.js";
 import { drops, LogView } from "./dropped_log.js";
 import { compact, count, spaced, span } from "./format.js";
 import { post } from "./http.js";
@@ -209,9 +209,7 @@ function draw(state) {
     $("now").dataset.key = key;
     $("now").replaceChildren(...now);
   }
-  const wrong = told || (failed ? `${failed.title} did not start. ${failed.text}` : "");
-  $("failed").hidden = !wrong;
-  setText($("failed"), wrong);
+  showText($("failed"), told || (failed ? `${failed.title} did not start. ${failed.text}` : ""));
 }
 session.addEventListener("state", (event) => draw(event.detail));
 

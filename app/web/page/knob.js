@@ -1,7 +1,7 @@
 // One line of the Tune panel: name, a logarithmic or linear slider with a tick at the configured value, the value with
 // its unit, ×10, ÷10 and back. It never argues with the user who turns it.
 
-import { $, element, setAttribute, setText } from "./dom.js";
+import { $, element, refusal, setAttribute, setText, showText } from "./dom.js";
 import { compact, spaced, words } from "./format.js";
 
 const DECADES = 3; // powers of ten to either side of the configured value
@@ -64,7 +64,7 @@ export class Knob {
     const step = (factor, text) =>
       element("button", { type: "button", title: `${text} ${label}`, "aria-label": `${label} ${text}`, onclick: () => this.set(this.value * factor) }, text);
     this.said = element("button", { type: "button", class: "data-says", hidden: true, onclick: () => this.take() }, "◆");
-    this.error = element("p", { class: "error", role: "alert", hidden: true });
+    this.error = refusal();
     this.below = element("div", { class: "below" });
     this.node = element(
       "div", { class: `knob${this.slides ? "" : " plain"}`, dataset: { key: what.key ?? what.label } },
@@ -201,8 +201,7 @@ export class Knob {
   }
 
   complain(reason) {
-    setText(this.error, reason ?? "");
-    this.error.hidden = !reason;
+    showText(this.error, reason);
     setAttribute(this.field, "aria-invalid", reason ? "true" : null);
   }
 }

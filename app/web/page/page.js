@@ -3,7 +3,7 @@
 import { Charts } from "./charts.js";
 import { keys, Tabs } from "./controls.js";
 import { Diagnose } from "./diagnose.js";
-import { $, element, setAttribute, setText } from "./dom.js";
+import { $, element, setAttribute, setText, showText } from "./dom.js";
 import { Explore } from "./explore.js";
 import { Faults } from "./faults.js";
 import { clock, setLabels } from "./format.js";
@@ -184,8 +184,7 @@ const leave = settings.gallery ? new Leave(model, settings.boot) : null;
 // Saved files of the twin: errors in them, and new configured values.
 let reloads = null;
 link.addEventListener("status", async ({ detail: { unread, reloads: now } }) => {
-  $("unread").hidden = !unread;
-  setText($("unread"), unread ? `${unread}. The running twin goes on unchanged.` : "");
+  showText($("unread"), unread ? `${unread}. The running twin goes on unchanged.` : "");
   if (reloads !== null && now !== reloads) tune.configure((await (await fetch("api/model")).json()).tuning);
   reloads = now;
 });

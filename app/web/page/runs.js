@@ -1,7 +1,7 @@
 // A table of all runs, newest first: filter, scores and change of each. Pinned ones stay on the charts; the menu of a row
 // has everything else.
 
-import { element, setText } from "./dom.js";
+import { element, refusal, showText } from "./dom.js";
 import { bracketed, compact, count, spaced, span, words } from "./format.js";
 import { post } from "./http.js";
 import { swatch } from "./layers.js";
@@ -19,7 +19,7 @@ export class Runs {
     this.chosen = []; // numbers of those that are compared, two at most
     this.subject = null; // whose RMSE is shown
     this.noted = null; // number of the run whose note is open
-    this.error = element("p", { class: "error", role: "alert", hidden: true });
+    this.error = refusal();
     this.compared = element("section", { class: "compared", "aria-label": "Two runs compared", hidden: true });
     this.table = element("table", { class: "runs" });
     this.of = element("label", { class: "error-of faint" });
@@ -47,8 +47,7 @@ export class Runs {
 
   async ask(command, fields) {
     const reason = await this.link.ask(command, fields);
-    setText(this.error, reason ?? "");
-    this.error.hidden = !reason;
+    showText(this.error, reason);
     this.key = null;
     return reason;
   }
@@ -193,7 +192,7 @@ class Versions {
     this.link = link;
     this.compared = null; // name of the one that is compared with what runs
     this.table = element("table", {});
-    this.error = element("p", { class: "error", role: "alert", hidden: true });
+    this.error = refusal();
     this.name = element("input", { type: "text", "aria-label": "Name of the version", placeholder: "name", maxlength: 60 });
     this.note = element("input", { type: "text", "aria-label": "Note on the version", placeholder: "note", maxlength: 2000 });
     const keep = element("button", { type: "submit", class: "go", title: "Save the running tuning as a version" }, "keep");
@@ -237,19 +236,14 @@ class Versions {
   async difference(name) {
     const answer = await fetch(`api/tunings/${encodeURIComponent(name)}/against`).catch(() => null);
     if (answer?.ok) return answer.json();
-    this.say((await answer?.json().catch(() => null))?.error ?? "no answer");
+    showText(this.error, (await answer?.json().catch(() => null))?.error ?? "no answer");
     return null;
-  }
-
-  say(reason) {
-    setText(this.error, reason ?? "");
-    this.error.hidden = !reason;
   }
 
   // Show the reason of a refusal; resolves to whether it was done.
   async ask(path, fields) {
-    const { error = null } = await post(path, fields);
-    this.say(error);
+    const { error } = await post(path, fields);
+    showText(this.error, error);
     await this.list();
     return !error;
   }

@@ -1,6 +1,6 @@
 // State of the session: the running twin, a start under way, a start that failed. Polled while the page is visible.
 
-import { $, element, setAttribute, setText } from "./dom.js";
+import { $, element, setAttribute, setText, showText } from "./dom.js";
 import { drops } from "./dropped_log.js";
 import { post } from "./http.js";
 
@@ -161,8 +161,7 @@ export class Leave {
 
   // What becomes of a file that was dropped: while another twin is being started this page goes on.
   say(text, wrong = false) {
-    setText($("toast"), text);
-    $("toast").hidden = !text;
+    showText($("toast"), text);
     $("toast").dataset.wrong = String(wrong);
     clearTimeout(this.timer);
     if (wrong) this.timer = setTimeout(() => this.say(""), READ);
@@ -172,8 +171,7 @@ export class Leave {
     this.session?.close();
     this.session = new Session(this.boot);
     this.session.addEventListener("state", ({ detail: { starting, failed } }) => {
-      if (starting) setText($("toast"), `${starting.title}: ${progress(starting)}`);
-      $("toast").hidden = !starting;
+      showText($("toast"), starting && `${starting.title}: ${progress(starting)}`);
       if (starting) return;
       this.session.close();
       this.session = null;

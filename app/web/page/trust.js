@@ -1,6 +1,6 @@
 // The strip on top: which filter, may it be trusted and if not why, NIS in its bounds, a light for each sensor.
 
-import { $, element, setAttribute, setText } from "./dom.js";
+import { $, element, refusal, setAttribute, setText, showText } from "./dom.js";
 import { clock, compact, inChartTime, spaced, span, words } from "./format.js";
 import { post } from "./http.js";
 
@@ -82,8 +82,7 @@ export class Trust {
     const file = status.recording?.split(/[\\/]/).pop() ?? "";
     const where = `Recording ${file} into ${status.recording_folder}`;
     setAttribute($("record"), "title", file ? `${where}: end it (R)` : "Record into a new .rrd file (R)");
-    $("recording").hidden = !file;
-    setText($("recording"), file);
+    showText($("recording"), file);
     setAttribute($("recording"), "title", where);
     const latency = typeof status.latency_ms === "number" ? `latency ${span(status.latency_ms / 1000)}` : "";
     setText($("latency"), latency);
@@ -110,8 +109,7 @@ export class Trust {
       live: "", waiting: "Connection lost, trying again", hidden: "",
       ended: "This session has ended; open the address that Nisus printed last",
     }[state];
-    setText($("connection"), text ?? "");
-    $("connection").hidden = !text;
+    showText($("connection"), text);
     $("connection").dataset.state = state;
   }
 }
@@ -318,7 +316,7 @@ export class UserNotes {
     this.node = element("section", { class: "notes", "aria-label": "Notes" }, element("header", {}, this.title, add), this.list);
     this.when = element("time", {});
     this.field = element("input", { type: "text", maxlength: MAX_NOTE, "aria-label": "Note", placeholder: "Note" });
-    this.error = element("p", { class: "error", role: "alert", hidden: true });
+    this.error = refusal();
     this.form = element(
       "form", { id: "note", popover: "manual", "aria-label": "Note at a moment", onsubmit: (event) => (event.preventDefault(), this.save()), onkeydown: (event) => event.key === "Escape" && this.close() },
       this.when, this.field, element("button", { type: "submit", class: "go" }, "Save"), element("button", { type: "button", onclick: () => this.close() }, "Cancel"), this.error,
@@ -378,8 +376,7 @@ export class UserNotes {
     const { number, from } = this.draft;
     const at = number === undefined ? { at: Number(this.link.status.origin) / 1e9 + from } : { number };
     const reason = await this.link.ask("Annotate", { text: this.field.value, ...at });
-    setText(this.error, reason ?? "");
-    this.error.hidden = !reason;
+    showText(this.error, reason);
     if (!reason) this.close();
   }
 }

@@ -1,6 +1,6 @@
 // The Tune panel: filter and options, noises, parameters, gate, sensors. Undo and redo.
 
-import { $, element, setAttribute, setText } from "./dom.js";
+import { $, element, refusal, setAttribute, setText, showText } from "./dom.js";
 import { Advice, Fit, Refit } from "./fit.js";
 import { compact, words } from "./format.js";
 import { Around, Gestures, Knob } from "./knob.js";
@@ -43,7 +43,7 @@ export class Tune {
     this.undoButton = button("undo", "↶", "Undo the last edit (U)", () => this.undo());
     this.redoButton = button("redo", "↷", "Redo (Shift-U)", () => this.redo());
     this.restoreButton = button("restore", "Restore", "Filter and tuning as the session began with", () => this.link.ask("Restore"));
-    this.notice = element("p", { class: "error", role: "alert", hidden: true });
+    this.notice = refusal();
     return element("header", { class: "panel-head" }, element("h2", {}, "Tune"), element("span", { class: "space" }), this.undoButton, this.redoButton, this.restoreButton, this.notice);
   }
 
@@ -308,8 +308,7 @@ export class Tune {
 
   async edit(command, fields) {
     const reason = await this.link.ask(command, fields);
-    setText(this.notice, reason ?? "");
-    this.notice.hidden = !reason;
+    showText(this.notice, reason);
     return reason;
   }
 

@@ -2,7 +2,7 @@
 // it reaches a limit. Nothing is asked while this is hidden.
 
 import { Chart, TimeAxis, band, dots, edge, line } from "./chart.js";
-import { element, setText } from "./dom.js";
+import { element, refusal, setText, showText } from "./dom.js";
 import { aboutMean, unbroken, wrapped } from "./drawing.js";
 import { bracketed, compact, spaced, span, withDeviation } from "./format.js";
 import { Range, shownExtent, within } from "./ranges.js";
@@ -50,7 +50,7 @@ export class WhatIf {
   begin() {
     this.slider = element("input", { type: "range", min: 0, max: STEPS, step: 1, "aria-label": "Horizon", oninput: () => this.turn() });
     this.length = element("output", {});
-    this.problem = element("p", { class: "error", role: "alert" });
+    this.problem = refusal();
     this.method = element("span", {});
     this.state = element("span", { class: "state", role: "status" });
     this.rows = new Map(this.model.inputs.map((input) => [input.name, inputRow(this, input)]));
@@ -148,9 +148,9 @@ export class WhatIf {
       const found = await told(await fetch("api/forecast", { method: "POST", headers, body: question }));
       this.asked = asked;
       this.take(found);
-      setText(this.problem, "");
+      showText(this.problem, "");
     } catch (error) {
-      setText(this.problem, error.message);
+      showText(this.problem, error.message);
     }
     this.busy = false;
     setText(this.state, "");

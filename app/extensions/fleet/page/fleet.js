@@ -1,7 +1,7 @@
 // The assets of a fleet, the worst first. Only the rows in view are asked for and drawn.
 
 import { keys } from "../page/controls.js";
-import { $, element, setAttribute, setText } from "../page/dom.js";
+import { $, element, setAttribute, setText, showText } from "../page/dom.js";
 import { bracketed, compact, count, span, withDeviation } from "../page/format.js";
 
 const POLL_MS = 1000;
@@ -71,15 +71,10 @@ async function ask(changed = false) {
     if (next.rows) draw((answer = next));
   }
   setText($("state"), found?.ok ? stateText() : found ? "" : "Nisus does not answer");
-  if (found && !found.ok) fail(await found.text());
+  if (found && !found.ok) showText($("failed"), await found.text());
   clearTimeout(timer);
   if (again) ask();
   else timer = setTimeout(() => ask(), POLL_MS);
-}
-
-function fail(text) {
-  $("failed").hidden = !text;
-  setText($("failed"), text);
 }
 
 const stateText = () => (answer ? ["", count(answer.assets, "asset"), answer.ended ? "source has ended" : "live", answer.stale ? `${count(answer.stale, "late event")} dropped` : null, answer.refused ? count(answer.refused, "problem") : null].filter(Boolean).join(" · ") : "");
@@ -89,13 +84,12 @@ function draw({ rows, first, found, assets, counts, histogram, siblings, failure
   $("rows").style.height = `${found * ROW}px`;
   $("rows").replaceChildren(...rows.map((row, k) => item(row, first + k)));
   if (focused) [...$("rows").children].find((node) => node.getAttribute("href") === focused)?.focus({ preventScroll: true });
-  $("none").hidden = found > 0;
-  setText($("none"), assets ? "No asset of that kind." : "No measurements yet.");
+  showText($("none"), found ? "" : assets ? "No asset of that kind." : "No measurements yet.");
   for (const head of $("heads").children) setAttribute(head, "aria-sort", head.dataset.sort && head.dataset.sort === query.sort ? (query.down ? "descending" : "ascending") : null);
   grades(counts, assets);
   distribution(histogram);
   beside(siblings);
-  fail(failure);
+  showText($("failed"), failure);
 }
 
 function item({ asset, id, health, cause, values }, place) {
