@@ -14,6 +14,21 @@ export function element(name, attributes = {}, ...children) {
   return made;
 }
 
+// Children of a node, one for each item by its key. Those of items that stay are left where they are: a button that is moved
+// or made anew under the pointer cannot be pressed.
+export function keyed(node, items, keyOf, make) {
+  const known = new Map([...node.children].map((child) => [child.dataset.key, child]));
+  const children = items.map((item) => {
+    const key = String(keyOf(item));
+    const child = known.get(key) ?? make(item);
+    child.dataset.key = key;
+    return child;
+  });
+  for (const child of [...node.children]) if (!children.includes(child)) child.remove();
+  children.forEach((child, k) => child === node.children[k] || node.insertBefore(child, node.children[k] ?? null));
+  return children;
+}
+
 export const $ = (id) => document.getElementById(id);
 
 // Writing the same text again would still cost a layout.

@@ -1,6 +1,6 @@
 // Faults on demand and maintenance: put something wrong into what the source says, and see how soon the twin tells.
 
-import { element, refusal, setText, showText } from "./dom.js";
+import { element, keyed, refusal, setText, showText } from "./dom.js";
 import { spaced, words } from "./format.js";
 import { section } from "./tune.js";
 
@@ -97,14 +97,9 @@ export class Faults {
   show(status) {
     if (!this.list) return; // of a recording there is none to put in
     const held = status.faults ?? [];
-    const key = JSON.stringify(held.map((fault) => fault.number));
-    if (key !== this.shown) {
-      this.shown = key;
-      const stop = ({ number }) => element("button", { type: "button", onclick: () => this.link.ask("ClearFault", { number }) }, "stop");
-      this.list.replaceChildren(...held.map((fault) => element("li", {}, element("span", {}), stop(fault))));
-    }
-    // In place: a button that is made anew with every count is hard to meet.
-    held.forEach((fault, k) => setText(this.list.children[k].firstChild, fault.text ?? words(fault.kind)));
+    const stop = ({ number }) => element("button", { type: "button", onclick: () => this.link.ask("ClearFault", { number }) }, "stop");
+    const entries = keyed(this.list, held, ({ number }) => number, (fault) => element("li", {}, element("span", {}), stop(fault)));
+    held.forEach((fault, k) => setText(entries[k].firstChild, fault.text ?? words(fault.kind)));
   }
 
   maintenanceSection() {

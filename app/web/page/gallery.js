@@ -2,7 +2,7 @@
 // signals instead.
 
 import { keys } from "./controls.js";
-import { $, element, setAttribute, setText, showText } from "./dom.js";
+import { $, element, keyed, setAttribute, setText, showText } from "./dom.js";
 import { drops, LogView } from "./dropped_log.js";
 import { compact, count, spaced, span } from "./format.js";
 import { post } from "./http.js";
@@ -139,9 +139,8 @@ const showLog = (name) => {
 function serve(twins) {
   const found = Object.fromEntries(shown.map((item) => [item.name, item]));
   if (twins.some(({ name }) => !found[name]) || shown.length !== twins.length) return list(); // of a folder that changed
-  twins.forEach((twin, place) => {
-    const { node } = found[twin.name];
-    if ($("cards").children[place] !== node) $("cards").insertBefore(node, $("cards").children[place] ?? null);
+  keyed($("cards"), twins, ({ name }) => name, ({ name }) => found[name].node).forEach((node, k) => {
+    const twin = twins[k];
     const runs = twin.state === "running";
     const health = runs ? twin.health ?? "waiting" : twin.state === "failed" ? "diverged" : "waiting";
     const again = twin.again_in === null ? "" : `; again in ${Math.ceil(twin.again_in)} s`;
@@ -196,19 +195,13 @@ function draw(state) {
   if (state.twins) serve(state.twins);
   else for (const item of shown) item.sync(state);
   const { running, starting, failed } = state;
-  const now = [];
-  if (starting) now.push(element("span", { class: "pill", dataset: { health: "suspect" } }, `${starting.title}: ${progress(starting)}`));
-  if (running)
-    now.push(
-      element("span", { class: "pill", dataset: { health: "tracking" } }, `● ${running.title} ${running.review ? "is open" : "runs"}`),
-      element("button", { type: "button", class: "go", onclick: open }, "Back to it"),
-      element("button", { type: "button", class: "go", onclick: stop }, running.review ? "Close" : "Stop"),
-    );
-  const key = JSON.stringify([running, starting]);
-  if ($("now").dataset.key !== key) {
-    $("now").dataset.key = key;
-    $("now").replaceChildren(...now);
-  }
+  const pill = (text, health) => [text, () => element("span", { class: "pill", dataset: { health } }, text)];
+  const button = (text, onclick) => [text, () => element("button", { type: "button", class: "go", onclick }, text)];
+  const now = [
+    ...(starting ? [pill(`${starting.title}: ${progress(starting)}`, "suspect")] : []),
+    ...(running ? [pill(`● ${running.title} ${running.review ? "is open" : "runs"}`, "tracking"), button("Back to it", open), button(running.review ? "Close" : "Stop", stop)] : []),
+  ];
+  keyed($("now"), now, ([text]) => text, ([, make]) => make());
   showText($("failed"), told || (failed ? `${failed.title} did not start. ${failed.text}` : ""));
 }
 session.addEventListener("state", (event) => draw(event.detail));

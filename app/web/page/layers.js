@@ -3,7 +3,7 @@
 
 import { Chart } from "./chart.js";
 import { aboutMean, unbroken } from "./drawing.js";
-import { $, element, setText } from "./dom.js";
+import { $, element, keyed, setText } from "./dom.js";
 import { bracketed, compact } from "./format.js";
 import { Range, extent, within } from "./ranges.js";
 import { Stream } from "./stream.js";
@@ -141,13 +141,14 @@ export class Pins {
       stream: new Stream(this.link, `run ${item.number}`), less: new Stream(this.link, `less ${item.number}`), reading: element("output", {}),
       ...this.pinned.find((pin) => pin.number === item.number), ...item,
     }));
-    this.legend.replaceChildren(
-      ...this.pinned.map((pin) =>
-        element("li", { style: `color: var(--pin-${pin.place})` },
-          swatch(pin.place), element("span", {}, `${pin.number}${pin.name ? ` ${pin.name}` : ""}${pin.running ? " (running)" : ""}`), pin.reading,
-          element("button", { type: "button", title: `Unpin run ${pin.number}`, "aria-label": `Unpin run ${pin.number}`, onclick: () => this.link.ask("Unpin", { number: pin.number }) }, "×")),
-      ),
-    );
+    const entry = (pin) =>
+      element("li", { style: `color: var(--pin-${pin.place})` },
+        swatch(pin.place), element("span", {}), pin.reading,
+        element("button", { type: "button", title: `Unpin run ${pin.number}`, "aria-label": `Unpin run ${pin.number}`, onclick: () => this.link.ask("Unpin", { number: pin.number }) }, "×"));
+    keyed(this.legend, this.pinned, ({ number, place }) => `${number}/${place}`, entry).forEach((node, k) => {
+      const { number, name, running } = this.pinned[k];
+      setText(node.children[1], `${number}${name ? ` ${name}` : ""}${running ? " (running)" : ""}`);
+    });
     // First in the legend of the charts, where the last entries give way.
     $("legend").querySelectorAll(".pinned").forEach((item) => item.remove());
     $("legend").prepend(...this.pinned.filter((pin) => !pin.running).map((pin) => element("li", { class: "pinned" }, swatch(pin.place), `run ${pin.number}${pin.name ? `: ${pin.name}` : ""}`)));
