@@ -1,8 +1,9 @@
 // Diagnose: are the innovations what the filter says they are, is the cloud healthy, what can be told, what could be
 // wrong unnoticed. Small multiples with one sentence each; nothing is asked while this is hidden.
 
-import { element, setText } from "./dom.js";
+import { changed, element, setText } from "./dom.js";
 import { compact, count, inChartTime, spaced, span, words } from "./format.js";
+import { get } from "./http.js";
 
 const AGAIN = 3000; // ms between two looks
 const MAX_OPEN_ROWS = 6; // rows that are all open
@@ -17,7 +18,7 @@ export class Diagnose {
   constructor(node, link, save) {
     Object.assign(this, { node, link, save });
     this.shown = false;
-    this.drawn = null;
+    this.drawn = false;
     this.turned = new Map(); // rows that the user has opened or closed, by name
   }
 
@@ -33,17 +34,9 @@ export class Diagnose {
 
   async ask() {
     clearTimeout(this.timer);
-    try {
-      const answer = await fetch("api/diagnose");
-      if (!answer.ok) throw new Error((await answer.text()).trim());
-      const text = await answer.text();
-      if (this.shown && text !== this.drawn) {
-        this.drawn = text;
-        this.draw(JSON.parse(text));
-      }
-    } catch (error) {
-      if (!this.drawn) setText(this.node, `No answer from the twin: ${error.message}`);
-    }
+    const found = await get("api/diagnose");
+    if (found.error && !this.drawn) setText(this.node, `No answer from the twin: ${found.error}`);
+    else if (!found.error && this.shown && changed(this.node, found)) this.draw(found);
     if (this.shown) this.timer = setTimeout(() => this.ask(), AGAIN);
   }
 
@@ -60,6 +53,7 @@ export class Diagnose {
       ...rows.map((row) => rowCard({ ...row, verdict: inChartTime(row.verdict, this.link.status.origin) }, found.marginal, open(row), (now) => this.turned.set(row.name, now))),
       element("div", { class: "cards" }, ...[ranksCard(found), particlesCard(found), varianceCard(found), correlationCard(found), ...unseenCards(found)].filter(Boolean)),
     );
+    this.drawn = true;
     this.savable(found.events);
     if (focused) this.node.querySelector(`[aria-label="${CSS.escape(focused)}"]`)?.focus();
     window.nisus.diagnosed = (window.nisus.diagnosed ?? 0) + 1;

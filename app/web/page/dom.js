@@ -36,6 +36,16 @@ export function setText(node, text) {
   if (node.textContent !== text) node.textContent = text;
 }
 
+const shown = new WeakMap(); // what was drawn last in a node, as JSON
+
+// Whether a value is another than that which was drawn last in a node.
+export function changed(node, value) {
+  const text = JSON.stringify(value);
+  if (text === shown.get(node)) return false;
+  shown.set(node, text);
+  return true;
+}
+
 // The text of a node that is hidden while it has none.
 export function showText(node, text) {
   setText(node, text ?? "");

@@ -3,7 +3,7 @@
 
 import { element, setText } from "./dom.js";
 import { clock, compact, count, span, spaced } from "./format.js";
-import { post } from "./http.js";
+import { get, post } from "./http.js";
 
 const RECORDING = ".rrd";
 const DATABASE = ".dbc";
@@ -63,7 +63,7 @@ export function drops({ say, follow, show = (name) => location.assign(address(na
 }
 
 async function send(file, tell) {
-  const { piece } = await (await fetch("api/gallery/recordings")).json();
+  const { piece } = await get("api/gallery/recordings");
   for (let offset = 0; ; offset += piece) {
     const last = offset + piece >= file.size;
     const query = new URLSearchParams({ name: file.name, offset, ...(last ? { last: 1 } : {}) });
@@ -462,8 +462,8 @@ export class LogView {
 
   // The next answer; while the session cannot be reached, the last one.
   async progressed(last) {
-    const found = await fetch("api/gallery/log/draft").then((response) => response.json()).catch(() => last);
-    if (this.name) this.follow(found);
+    const found = await get("api/gallery/log/draft");
+    if (this.name) this.follow(found.state ? found : last);
   }
 }
 

@@ -2,6 +2,7 @@
 
 import { element, keyed, refusal, setText, showText } from "./dom.js";
 import { spaced, words } from "./format.js";
+import { get } from "./http.js";
 import { section } from "./tune.js";
 
 export class Faults {
@@ -11,9 +12,8 @@ export class Faults {
   }
 
   async begin() {
-    const answer = await fetch("api/faults");
-    if (!answer.ok) return;
-    this.catalogue = await answer.json();
+    this.catalogue = await get("api/faults");
+    if (this.catalogue.error) return;
     this.node.append(element("h2", { class: "unseen" }, "Faults and maintenance"), this.faultSection(), this.maintenanceSection());
     this.link.addEventListener("status", (event) => this.show(event.detail));
     this.show(this.link.status);

@@ -4,7 +4,7 @@
 import { Panel } from "./controls.js";
 import { element, refusal, setText, showText } from "./dom.js";
 import { clock, compact, count, spaced, span, words } from "./format.js";
-import { post } from "./http.js";
+import { get, post } from "./http.js";
 
 const FIT_PERIOD = 300; // ms between two progress queries
 const GROUPS = { Q: "Q", R: "R", p: "parameters", options: "options" };
@@ -255,8 +255,7 @@ export class Refit {
   }
 
   async look() {
-    const answer = await fetch("api/refit").catch(() => null);
-    if (answer?.ok) this.show(await answer.json());
+    this.show(await get("api/refit"));
   }
 
   // Says why where it is refused.

@@ -5,7 +5,7 @@ import { keys } from "./controls.js";
 import { $, element, keyed, setAttribute, setText, showText } from "./dom.js";
 import { drops, LogView } from "./dropped_log.js";
 import { compact, count, spaced, span } from "./format.js";
-import { post } from "./http.js";
+import { get, post } from "./http.js";
 import { card, progress, Session } from "./session.js";
 
 const SUMMARY_POLL_MS = 1500; // while a file is being summarised
@@ -31,8 +31,8 @@ class Recordings {
   async refresh() {
     clearTimeout(this.timer);
     if (document.hidden) return;
-    const answer = await fetch("api/gallery/recordings").catch(() => null);
-    if (answer?.ok) this.draw(await answer.json());
+    const found = await get("api/gallery/recordings");
+    if (!found.error) this.draw(found);
     clearTimeout(this.timer);
     this.timer = setTimeout(() => this.refresh(), this.looking ? SUMMARY_POLL_MS : POLL_MS);
   }
@@ -222,12 +222,12 @@ if (recordings) commands.push(["a", "add a file to the recordings", () => record
 keys(commands);
 
 async function list() {
-  const answer = await fetch("api/gallery");
-  if (!answer.ok) {
+  const twins = await get("api/gallery");
+  if (twins.error) {
     setText($("none"), "The twins could not be listed; reload the page.");
-    throw new Error(await answer.text());
+    throw new Error(twins.error);
   }
-  shown = (await answer.json()).map((item) => card(item, { start, open }));
+  shown = twins.map((item) => card(item, { start, open }));
   $("cards").replaceChildren(...shown.map((item) => item.node));
 }
 await list();

@@ -1,6 +1,7 @@
-// Questions to the server and their answers.
+// Questions to the server and their answers: each resolves to the answer, or to {error} with the reason.
 
-// Resolves to the answer, or {error} with the reason.
+export const get = (path) => post(path, undefined, "GET");
+
 export async function post(path, body, method = "POST") {
   try {
     const answer = await fetch(path, { method, headers: { "Content-Type": "application/json" }, body: JSON.stringify(body) });

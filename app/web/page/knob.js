@@ -3,6 +3,7 @@
 
 import { $, element, refusal, setAttribute, setText, showText } from "./dom.js";
 import { compact, spaced, words } from "./format.js";
+import { get } from "./http.js";
 
 const DECADES = 3; // powers of ten to either side of the configured value
 const STEPS = 1000;
@@ -274,13 +275,13 @@ export class Around {
 
   async ask(due, curves) {
     for (const curve of curves) {
-      const answer = await fetch(`api/around?key=${encodeURIComponent(curve.key)}`).catch(() => null);
-      if (answer?.ok) curve.take(await answer.json());
+      const swept = await get(`api/around?key=${encodeURIComponent(curve.key)}`);
+      if (!swept.error) curve.take(swept);
     }
     if (!due) return;
-    const answer = await fetch("api/noise").catch(() => null);
-    if (!answer?.ok) return;
-    this.said = await answer.json();
+    const said = await get("api/noise");
+    if (said.error) return;
+    this.said = said;
     this.mark();
   }
 

@@ -7,6 +7,7 @@ import { $, element, setAttribute, setText, showText } from "./dom.js";
 import { Explore } from "./explore.js";
 import { Faults } from "./faults.js";
 import { clock, setLabels } from "./format.js";
+import { get } from "./http.js";
 import { Link } from "./link.js";
 import { Runs } from "./runs.js";
 import { Save } from "./save.js";
@@ -28,9 +29,8 @@ $("theme").addEventListener("click", () => {
   location.reload();
 });
 
-const answer = await fetch("api/model");
-if (!answer.ok) throw new Error(await answer.text());
-const model = await answer.json();
+const model = await get("api/model");
+if (model.error) throw new Error(model.error);
 setLabels(model);
 const kinds = await Promise.all(settings.charts.map((name) => import(`./charts/${name}`)));
 window.nisus = { model, drawn: 0, revision: null };
@@ -185,7 +185,7 @@ const leave = settings.gallery ? new Leave(model, settings.boot) : null;
 let reloads = null;
 link.addEventListener("status", async ({ detail: { unread, reloads: now } }) => {
   showText($("unread"), unread ? `${unread}. The running twin goes on unchanged.` : "");
-  if (reloads !== null && now !== reloads) tune.configure((await (await fetch("api/model")).json()).tuning);
+  if (reloads !== null && now !== reloads) tune.configure((await get("api/model")).tuning);
   reloads = now;
 });
 

@@ -3,7 +3,7 @@
 
 import { element, refusal, showText } from "./dom.js";
 import { bracketed, compact, count, spaced, span, words } from "./format.js";
-import { post } from "./http.js";
+import { get, post } from "./http.js";
 import { swatch } from "./layers.js";
 import { gone } from "./save.js";
 
@@ -37,10 +37,10 @@ export class Runs {
     if (this.node.contains(document.activeElement) && document.activeElement.matches("input, textarea")) return;
     if (this.noted !== null || document.querySelector("#save-menu:popover-open")) return;
     this.asking = true;
-    const answer = await fetch("api/runs").catch(() => null);
+    const runs = await get("api/runs");
     this.asking = false;
-    if (!answer?.ok) return;
-    [this.key, this.when, this.runs] = [key, performance.now(), await answer.json()];
+    if (runs.error) return;
+    Object.assign(this, { key, when: performance.now(), runs });
     this.versions.list();
     this.show();
   }
@@ -155,13 +155,9 @@ export class Runs {
     this.compared.hidden = this.chosen.length < 2;
     if (this.compared.hidden) return;
     const [a, b] = this.chosen;
-    const answer = await fetch(`api/runs/${a}/against/${b}`).catch(() => null);
-    if (!answer?.ok) return;
-    const differ = await answer.json();
-    const shown = (value) => (typeof value === "number" ? compact(value, 6) : value === null ? "off" : String(value));
-    const head = element("tr", {}, element("th", { scope: "col" }, "entry"), ...[a, b].map((number) => element("th", { scope: "col" }, `run ${number}`)));
-    const rows = differ.map((entry) => element("tr", {}, element("th", { scope: "row" }, entry.key), ...entry.values.map((value) => element("td", {}, shown(value)))));
-    this.compared.replaceChildren(element("table", {}, element("thead", {}, head), element("tbody", {}, ...rows)), ...(rows.length ? [] : [element("p", { class: "faint" }, "No differences.")]));
+    const differ = await get(`api/runs/${a}/against/${b}`);
+    if (differ.error) return;
+    this.compared.replaceChildren(differences([`run ${a}`, `run ${b}`], differ), ...(differ.length ? [] : [element("p", { class: "faint" }, "No differences.")]));
   }
 }
 
@@ -203,9 +199,8 @@ class Versions {
 
   // While the tab is shown; the focus stays where it is.
   async list() {
-    const answer = await fetch("api/tunings").catch(() => null);
-    if (!answer?.ok) return;
-    const { running, versions, guard } = await answer.json();
+    const { running, versions, guard, error } = await get("api/tunings");
+    if (error) return;
     // Open from the start if there is something to choose.
     if (this.listed === undefined) this.node.open = versions.length > 1 || guard.some((each) => each.failure || each.worse.length);
     this.listed = versions.length;
@@ -230,13 +225,13 @@ class Versions {
         element("td", {}, compact(scores.nis, 3)), element("td", {}, compact(scores.log_likelihood, 4)),
         element("td", {}, button("load", "Load and fold the history again", () => this.ask("api/tunings/load", { name })), button("⇄", "Compare with the running tuning", compare, { "aria-pressed": String(this.compared === name) }))),
       element("tr", { class: error ? "error" : "faint" }, element("td", { colspan: 4 }, about)),
-      this.compared === name && differ ? element("tr", {}, element("td", { colspan: 4 }, differences(name, differ))) : null);
+      this.compared === name && differ ? element("tr", {}, element("td", { colspan: 4 }, differ.length ? differences([name, "running"], differ) : "No differences from the running tuning.")) : null);
   }
 
   async difference(name) {
-    const answer = await fetch(`api/tunings/${encodeURIComponent(name)}/against`).catch(() => null);
-    if (answer?.ok) return answer.json();
-    showText(this.error, (await answer?.json().catch(() => null))?.error ?? "no answer");
+    const differ = await get(`api/tunings/${encodeURIComponent(name)}/against`);
+    if (!differ.error) return differ;
+    showText(this.error, differ.error);
     return null;
   }
 
@@ -268,9 +263,9 @@ function guarded(each, versions) {
   return element("span", { class: failure || worse.length ? "error" : "", title, dataset: { guarded: recording } }, `${failure || worse.length ? "✗" : "✓"} guard, ${at.slice(0, 16).replace("T", " ")} UTC, ${recording} with ${version || "?"}: ${verdict}${since}`);
 }
 
-function differences(name, differ) {
-  if (!differ.length) return "No differences from the running tuning.";
+// The entries in which two differ: a column for each of the two.
+function differences(names, differ) {
   const shown = (value) => (typeof value === "number" ? compact(value, 6) : value === null ? "off" : String(value));
-  const head = element("tr", {}, ...["entry", name, "running"].map((text) => element("th", { scope: "col" }, text)));
+  const head = element("tr", {}, ...["entry", ...names].map((text) => element("th", { scope: "col" }, text)));
   return element("table", {}, element("thead", {}, head), element("tbody", {}, ...differ.map((entry) => element("tr", {}, element("th", { scope: "row" }, entry.key), ...entry.values.map((value) => element("td", {}, shown(value)))))));
 }

@@ -2,7 +2,7 @@
 
 import { $, element, setAttribute, setText, showText } from "./dom.js";
 import { drops } from "./dropped_log.js";
-import { post } from "./http.js";
+import { get, post } from "./http.js";
 
 const REST = 700; // ms
 const HASTE = 250; // while something is being started
@@ -26,8 +26,8 @@ export class Session extends EventTarget {
   async ask() {
     clearTimeout(this.timer);
     if (document.hidden || this.closed) return;
-    const answer = await fetch("api/session").catch(() => null);
-    if (answer?.ok && !this.closed) this.take(await answer.json());
+    const state = await get("api/session");
+    if (!state.error && !this.closed) this.take(state);
     clearTimeout(this.timer);
     if (!this.closed) this.timer = setTimeout(() => this.ask(), this.state?.starting ? HASTE : REST);
   }
@@ -144,8 +144,8 @@ export class Leave {
   // A link of another twin was opened: what runs goes on, unless that is started. The address stays, and with it the
   // moment to which the other twin's page goes.
   async offer(twin, reason) {
-    const all = await fetch("api/gallery").then((answer) => answer.json()).catch(() => []);
-    const item = named(all, twin);
+    const all = await get("api/gallery");
+    const item = !all.error && named(all, twin);
     if (!item) return this.say(`${reason}. No twin of that name can be started here`, true);
     const start = async () => {
       const answer = await post("api/gallery/start", { twin: item.name });

@@ -2,7 +2,7 @@
 
 import { $, element, refusal, setAttribute, setText, showText } from "./dom.js";
 import { clock, compact, inChartTime, spaced, span, words } from "./format.js";
-import { post } from "./http.js";
+import { get, post } from "./http.js";
 
 // Signs beside the colours, for users who cannot distinguish them.
 export const SIGNS = {
@@ -215,14 +215,8 @@ export class Episodes {
   // Attribute the change of each state between two times to its causes, the largest first.
   async explain(since, until) {
     this.change.replaceChildren(element("li", { class: "faint" }, "folding …"));
-    let found;
-    try {
-      const answer = await fetch(`api/why?since=${since}&until=${until}`);
-      found = await answer.json();
-      if (found.error) throw new Error(found.error);
-    } catch (error) {
-      return this.change.replaceChildren(element("li", { class: "error" }, error.message));
-    }
+    const found = await get(`api/why?since=${since}&until=${until}`);
+    if (found.error) return this.change.replaceChildren(element("li", { class: "error" }, found.error));
     this.change.replaceChildren(
       element("li", { class: "faint" }, `${clock(found.start)} – ${clock(found.end)}`),
       ...Object.entries(found.states).map(([name, state]) => element("li", {}, element("b", {}, words(name)), ` ${this.moved(state)}`)),
@@ -232,15 +226,14 @@ export class Episodes {
 
   // The audit log, newest first: who changed what, from where.
   async list() {
-    const answer = await fetch("api/audit").catch(() => null);
-    const entries = answer?.ok ? (await answer.json()).reverse() : [];
+    const entries = await get("api/audit");
     const item = ({ at, user, role, address, path, body, revision }) => {
       const { command, gesture, ...fields } = body;
       const what = [command ?? path.replace(/^\/api\//, ""), ...Object.entries(fields).map(([key, value]) => `${key} ${typeof value === "object" ? JSON.stringify(value) : value}`)].join(", ");
       const when = new Date(1000 * at).toLocaleString("en-GB", { dateStyle: "short", timeStyle: "medium" });
       return element("li", { class: "event", dataset: { level: "info" } }, element("time", {}, when), element("span", {}, `${user}${role && role !== user ? ` (${role})` : ""}${address ? ` from ${address}` : ""}, run ${revision}: ${what}`));
     };
-    this.commands.replaceChildren(...(entries.length ? entries.slice(0, MAX_EPISODES).map(item) : [element("li", { class: "faint" }, answer?.ok ? "None yet." : "Nisus does not answer.")]));
+    this.commands.replaceChildren(...(entries.length ? entries.slice(-MAX_EPISODES).reverse().map(item) : [element("li", { class: "faint" }, entries.error ? "Nisus does not answer." : "None yet.")]));
   }
 
   moved({ unit, before, after, model, inputs, sensors, restarts, largest }) {

@@ -5,6 +5,7 @@ import { Chart, TimeAxis, band, dots, edge, line } from "./chart.js";
 import { element, refusal, setText, showText } from "./dom.js";
 import { aboutMean, unbroken, wrapped } from "./drawing.js";
 import { bracketed, compact, spaced, span, withDeviation } from "./format.js";
+import { get, post } from "./http.js";
 import { Range, shownExtent, within } from "./ranges.js";
 import { Stream } from "./stream.js";
 import { inputChart, inputRow, levels, probability, profile } from "./whatif_inputs.js";
@@ -129,45 +130,43 @@ export class WhatIf {
 
   get question() {
     const inputs = Object.fromEntries(Object.entries(this.inputs).map(([name, chosen]) => [name, profile(chosen, this.rows.get(name).now, this.horizon)]));
-    return JSON.stringify({ horizon: this.horizon, inputs, limits: this.limits });
+    return { horizon: this.horizon, inputs, limits: this.limits };
   }
 
   async ask() {
     if (this.busy) return this.next(SOON);
     const status = this.link.status;
-    let { question } = this;
-    const asked = `${status.t} ${status.revision} ${question}`;
+    const asked = `${status.t} ${status.revision} ${JSON.stringify(this.question)}`;
     if (asked === this.asked) return this.next(AGAIN); // paused: nothing would come out differently
     this.busy = true;
     setText(this.state, "computing …");
     const begun = performance.now();
-    try {
-      if (this.horizon === null || !this.longest) await this.learn();
-      question = this.question;
-      const headers = { "Content-Type": "application/json" };
-      const found = await told(await fetch("api/forecast", { method: "POST", headers, body: question }));
+    const unknown = this.longest ? null : await this.learn();
+    const { question } = this;
+    const found = unknown ?? (await post("api/forecast", question));
+    showText(this.problem, found.error);
+    if (!found.error) {
       this.asked = asked;
       this.take(found);
-      showText(this.problem, "");
-    } catch (error) {
-      showText(this.problem, error.message);
     }
     this.busy = false;
     setText(this.state, "");
     // What was chosen meanwhile is asked for at once.
     const rest = Math.max(AGAIN, Math.min(LONGEST_REST, REST * (performance.now() - begun)));
-    this.next(question === this.question ? rest : SOON);
+    this.next(JSON.stringify(question) === JSON.stringify(this.question) ? rest : SOON);
   }
 
-  // How far can be asked for.
+  // How far can be asked for. Resolves to {error} where that is not known.
   async learn() {
-    const may = await told(await fetch("api/forecast"));
+    const may = await get("api/forecast");
+    if (may.error) return may;
     this.longest = may.longest;
     this.shortest = Math.min(may.longest / 2, 10 * may.step);
     const horizon = this.horizon ?? 3 * this.model.window;
     this.horizon = Math.min(this.longest, Math.max(this.shortest, horizon));
     this.placeSlider();
     this.look();
+    return null;
   }
 
   take(found) {
@@ -193,12 +192,6 @@ export class WhatIf {
     this.axis.show(range);
     this.explain(this.parts);
   }
-}
-
-async function told(answer) {
-  const text = await answer.text();
-  if (answer.ok) return JSON.parse(text);
-  throw new Error(answer.headers.get("content-type")?.includes("json") ? JSON.parse(text).error : text.trim());
 }
 
 function limitField(whatif, state) {
