@@ -1,7 +1,7 @@
 // The stack of charts: one time axis, one cursor. The kinds of charts are the files of the folder charts.
 
 import { Chart, declared, TimeAxis } from "./chart.js";
-import { $, element, setAttribute, setText } from "./dom.js";
+import { $, changed, element, setAttribute, setText } from "./dom.js";
 import { Pins, Previous, Smoothed, Strong } from "./layers.js";
 import { Stream } from "./stream.js";
 import { SIGNS } from "./trust.js";
@@ -227,9 +227,7 @@ export class Charts {
     if (shown.some((chart) => chart.plot?.advised)) add("health-advisory", "advisory", { mark: "line", tone: "health-advisory", width: 2.5 });
     if (shown.some((chart) => chart.outsiders?.length)) add("outside", "off scale", { mark: "triangle", tone: "faint" });
     const items = Object.keys(LEGEND).flatMap((key) => (found.has(key) ? [[key, ...found.get(key)]] : []));
-    const written = items.map(([, text]) => text).join();
-    if (written === this.explained) return;
-    this.explained = written;
+    if (!changed($("legend"), items.map(([, text]) => text))) return;
     $("legend").querySelectorAll("li:not(.pinned)").forEach((item) => item.remove());
     $("legend").append(...items.map(([key, text, style]) => element("li", { title: LEGEND[key][1], dataset: { key } }, sample(style), text)));
   }

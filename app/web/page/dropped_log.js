@@ -1,7 +1,7 @@
 // Files dropped on the page: sent in pieces to the folder of recordings, then opened. A recording opens for review; a log
 // opens with its signals, the twins that fit, and a draft of a twin.
 
-import { element, setText } from "./dom.js";
+import { changed, element, setText } from "./dom.js";
 import { clock, compact, count, span, spaced } from "./format.js";
 import { get, post } from "./http.js";
 
@@ -106,7 +106,8 @@ export class LogView {
 
   open(name) {
     if (name === this.name) return;
-    Object.assign(this, { name, dbc: null, time: null, unit: "s", zone: null, log: null, roles: new Map(), shown: null, proposed: null, drafts: false });
+    Object.assign(this, { name, dbc: null, time: null, unit: "s", zone: null, log: null, roles: new Map(), proposed: null, drafts: false });
+    changed(this.node, null);
     this.node.replaceChildren(element("p", { class: "faint reading", role: "status" }, `${name}: reading …`));
     this.read();
   }
@@ -144,10 +145,8 @@ export class LogView {
   }
 
   draw(log) {
-    const key = JSON.stringify({ ...log, roles: null, proposing: null, unproposed: null, draft_name: null });
     this.log = log;
-    if (key !== this.shown) {
-      this.shown = key;
+    if (changed(this.node, { ...log, roles: null, proposing: null, unproposed: null, draft_name: null })) {
       this.seen.disconnect();
       this.rows.clear();
       this.node.replaceChildren(this.head(log), ...(log.error ? [this.failure(log)] : [this.body(log)]));

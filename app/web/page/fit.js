@@ -2,7 +2,7 @@
 // on held-out data.
 
 import { Panel } from "./controls.js";
-import { element, refusal, setText, showText } from "./dom.js";
+import { changed, element, refusal, setText, showText } from "./dom.js";
 import { clock, compact, count, spaced, span, words } from "./format.js";
 import { get, post } from "./http.js";
 
@@ -92,9 +92,8 @@ export class Fit {
       this.timer = setTimeout(() => this.ask("GET"), FIT_PERIOD);
     }
     if (told.state === "failed") showText(this.error, told.reason);
-    const key = `${told.number}/${told.state}/${told.current}`;
-    if (key === this.key) return;
-    [this.key, this.told] = [key, told];
+    if (!changed(this.result, [told.number, told.state, told.current])) return;
+    this.told = told;
     if (told.state === "cancelled") this.result.replaceChildren(element("p", { class: "faint" }, `Cancelled after ${told.folds} folds.`));
     else this.result.replaceChildren(...(told.result ? fitted(told, this.offers(told)) : []));
   }
@@ -247,10 +246,7 @@ export class Refit {
     link.addEventListener("status", ({ detail }) => {
       this.card.hidden = !detail.refit;
       if (this.card.hidden) return;
-      const key = JSON.stringify([detail.refit, detail.reloads]);
-      if (key === this.key) return;
-      this.key = key;
-      this.look();
+      if (changed(this.card, [detail.refit, detail.reloads])) this.look();
     });
   }
 
@@ -344,9 +340,7 @@ export class Advice {
     setText(this.button, busy ? `Advice ${percent(told.progress.share ?? 0)}` : "Advice…");
     const idle = told.advice ? (told.current ? "" : `of run ${told.revision}; another runs now`) : told.state === "cancelled" ? "Cancelled." : "nothing measured yet: it folds the log by one filter after another";
     setText(this.said, told.state === "cancelling" ? "ending …" : busy ? `${told.progress.question} ${left(told.progress.left, told.progress.elapsed)}` : idle);
-    const key = `${told.state}/${told.revision}/${told.current}`;
-    if (key === this.key) return;
-    this.key = key;
+    if (!changed(this.cards, [told.state, told.revision, told.current])) return;
     this.told = told;
     this.cards.replaceChildren(...(told.advice ? [this.recommended(told), this.excluded(told.advice), ...told.advice.claims.map((claim) => this.claim(claim, told.advice.because))].filter(Boolean) : []));
   }

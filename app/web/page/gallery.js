@@ -2,7 +2,7 @@
 // signals instead.
 
 import { keys } from "./controls.js";
-import { $, element, keyed, setAttribute, setText, showText } from "./dom.js";
+import { $, changed, element, keyed, setAttribute, setText, showText } from "./dom.js";
 import { drops, LogView } from "./dropped_log.js";
 import { compact, count, spaced, span } from "./format.js";
 import { get, post } from "./http.js";
@@ -15,7 +15,7 @@ const POLL_MS = 5000;
 // say(text), which reports an error.
 class Recordings {
   constructor(node, ask) {
-    Object.assign(this, { node, ask, key: null });
+    Object.assign(this, { node, ask });
     this.list = element("ol", { class: "files" });
     this.where = element("p", { class: "faint where" });
     this.choose = element("input", { type: "file", multiple: true, hidden: true, onchange: () => this.ask.drop([...this.choose.files]) });
@@ -39,9 +39,7 @@ class Recordings {
 
   draw({ folder, files }) {
     this.looking = files.some((file) => file.looking);
-    const key = JSON.stringify(files);
-    if (key === this.key) return;
-    this.key = key;
+    if (!changed(this.list, files)) return;
     setText(this.where, `Kept in ${folder}. Record one on a twin's page (R), or drop a recording, a log (CSV, Parquet, MF4, BLF, ASC, candump, MAT, NPZ, MCAP) or a DBC here.`);
     // What is asked of one file stays asked while the list is drawn anew.
     const asked = this.list.querySelector("[data-asked]")?.dataset.name;
@@ -87,7 +85,7 @@ class Recordings {
       const answer = await post("api/gallery/recordings/delete", { name });
       delete node.dataset.asked;
       if (answer.error) this.ask.say(answer.error);
-      this.key = null;
+      changed(this.list, null); // without what is asked there
       this.refresh();
     };
     const yes = element("button", { type: "button", class: "go danger", onclick: remove }, "Delete for good");

@@ -3,7 +3,7 @@
 
 import { Chart } from "./chart.js";
 import { aboutMean, unbroken } from "./drawing.js";
-import { $, element, keyed, setText } from "./dom.js";
+import { $, changed, element, keyed, setText } from "./dom.js";
 import { bracketed, compact } from "./format.js";
 import { Range, extent, within } from "./ranges.js";
 import { Stream } from "./stream.js";
@@ -133,9 +133,7 @@ export class Pins {
 
   update(status) {
     const pinned = status.runs?.pinned ?? [];
-    const key = JSON.stringify(pinned);
-    if (key === this.key) return;
-    this.key = key;
+    if (!changed(this.legend, pinned)) return;
     for (const pin of this.pinned) if (!pinned.some((item) => item.number === pin.number && !item.running)) close(pin);
     this.pinned = pinned.map((item) => ({
       stream: new Stream(this.link, `run ${item.number}`), less: new Stream(this.link, `less ${item.number}`), reading: element("output", {}),

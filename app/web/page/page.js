@@ -3,7 +3,7 @@
 import { Charts } from "./charts.js";
 import { keys, Tabs } from "./controls.js";
 import { Diagnose } from "./diagnose.js";
-import { $, element, setAttribute, setText, showText } from "./dom.js";
+import { $, changed, element, setAttribute, setText, showText } from "./dom.js";
 import { Explore } from "./explore.js";
 import { Faults } from "./faults.js";
 import { clock, setLabels } from "./format.js";
@@ -169,9 +169,7 @@ $("record").addEventListener("click", record);
 
 link.addEventListener("status", (event) => {
   const names = event.detail.recordings ?? [];
-  const key = names.join("\n");
-  if ($("recordings").dataset.names === key) return;
-  $("recordings").dataset.names = key;
+  if (!changed($("recordings"), names)) return;
   $("recordings").replaceChildren(
     ...names.slice(-3).map((name) => element("a", { href: `rec/${encodeURIComponent(name)}`, download: name, title: "Download recording" }, name)),
   );

@@ -1,6 +1,6 @@
 // The stage: Viser's scene in a frame, and the choices about it, which also hold for a window of its own.
 
-import { $, element, setAttribute, setText } from "./dom.js";
+import { $, changed, element, setAttribute, setText } from "./dom.js";
 import { clock, span, words } from "./format.js";
 import { post } from "./http.js";
 
@@ -65,9 +65,7 @@ export class Stage {
   }
 
   offer(choices) {
-    const shape = JSON.stringify(choices.map(({ key, options }) => [key, options]));
-    if (shape !== this.shape) {
-      this.shape = shape;
+    if (changed($("stage-choices"), choices.map(({ key, options }) => [key, options]))) {
       this.choices = Object.fromEntries(choices.map((choice) => [choice.key, this.select(choice)]));
       $("stage-choices").replaceChildren(
         ...choices.map((choice) => element("label", {}, element("span", {}, choice.label), this.choices[choice.key])),

@@ -1,6 +1,6 @@
 // The strip on top: which filter, may it be trusted and if not why, NIS in its bounds, a light for each sensor.
 
-import { $, element, refusal, setAttribute, setText, showText } from "./dom.js";
+import { $, changed, element, refusal, setAttribute, setText, showText } from "./dom.js";
 import { clock, compact, inChartTime, spaced, span, words } from "./format.js";
 import { get, post } from "./http.js";
 
@@ -202,9 +202,7 @@ export class Episodes {
   // Measurement counts; those of each sensor in the tooltip.
   count({ counts }) {
     const found = KINDS.filter(([key]) => counts[key]).map(([key, name]) => [key, name, counts[key]]);
-    const text = JSON.stringify([found, counts.readings]);
-    if (text === this.counted) return;
-    this.counted = text;
+    if (!changed(this.counts, [found, counts.readings])) return;
     const whose = (key) => Object.entries(counts).filter(([name]) => name.startsWith(`${key} `)).map(([name, n]) => `${words(name.slice(key.length + 1))} ${n}`).join("\n");
     this.counts.replaceChildren(
       element("dt", {}, "measurements"), element("dd", {}, grouped(counts.readings ?? 0)),

@@ -1,6 +1,6 @@
 // The Tune panel: filter and options, noises, parameters, gate, sensors. Undo and redo.
 
-import { $, element, refusal, setAttribute, setText, showText } from "./dom.js";
+import { $, changed, element, refusal, setAttribute, setText, showText } from "./dom.js";
 import { Advice, Fit, Refit } from "./fit.js";
 import { compact, words } from "./format.js";
 import { Around, Gestures, Knob } from "./knob.js";
@@ -247,11 +247,7 @@ export class Tune {
     const gate = status.gate ?? null;
     const known = [...GATES];
     if (!known.some(([, value]) => value === gate)) known.push([`${Number((100 * gate).toPrecision(8))} %`, gate]);
-    const wanted = JSON.stringify(known);
-    if (this.gates !== wanted) {
-      this.gates = wanted;
-      this.gate.replaceChildren(...known.map(([text, value]) => element("option", { value: value === null ? "off" : value }, text)));
-    }
+    if (changed(this.gate, known)) this.gate.replaceChildren(...known.map(([text, value]) => element("option", { value: value === null ? "off" : value }, text)));
     if (document.activeElement !== this.gate) this.gate.value = gate === null ? "off" : String(gate);
     if (document.activeElement !== this.kind) this.kind.value = status.gate_kind ?? "hard";
     this.kind.disabled = gate === null;
