@@ -27,6 +27,16 @@ export function lightPalette() {
   throw new Error("the style sheet of the page was not loaded; reload the page");
 }
 
+// The context of a canvas, cleared and as fine as the screen, to draw in px of the page.
+export function fineContext(canvas) {
+  const size = [canvas.clientWidth, canvas.clientHeight].map((length) => Math.round(length * devicePixelRatio));
+  if (canvas.width !== size[0] || canvas.height !== size[1]) [canvas.width, canvas.height] = size;
+  const ctx = canvas.getContext("2d");
+  ctx.setTransform(devicePixelRatio, 0, 0, devicePixelRatio, 0, 0);
+  ctx.clearRect(0, 0, canvas.clientWidth, canvas.clientHeight);
+  return ctx;
+}
+
 // The context of a plot in which nothing leaves its frame, until it is restored.
 export function clipped({ ctx, bbox }) {
   ctx.save();
@@ -36,13 +46,31 @@ export function clipped({ ctx, bbox }) {
   return ctx;
 }
 
+// A line through places of a canvas, px.
+export function stroke(ctx, places, tone, width = devicePixelRatio, dash = []) {
+  ctx.strokeStyle = colour(tone);
+  ctx.lineWidth = width;
+  ctx.setLineDash(dash);
+  ctx.beginPath();
+  for (const place of places) ctx.lineTo(...place);
+  ctx.stroke();
+}
+
+// The area within places of a canvas, px.
+export function fill(ctx, places, tone) {
+  ctx.fillStyle = colour(tone);
+  ctx.beginPath();
+  for (const place of places) ctx.lineTo(...place);
+  ctx.fill();
+}
+
 // A curve {x, values, tone, width, dash}, broken where a value is null; undefined values are skipped. With `fill`, a
 // share of opacity, an area with that outline.
-export function trace(plot, { x, values, tone, width = 1, dash = [], fill }) {
+export function trace(plot, { x, values, tone, width = 1, dash = [], fill: opacity }) {
   if (!x.length) return;
   const ctx = clipped(plot);
   const scale = devicePixelRatio;
-  const [from, to] = fill ? [0, x.length - 1] : within(x, [plot.scales.x.min, plot.scales.x.max]);
+  const [from, to] = opacity ? [0, x.length - 1] : within(x, [plot.scales.x.min, plot.scales.x.max]);
   ctx.beginPath();
   let open = false;
   for (let k = Math.max(0, from - 1); k <= Math.min(x.length - 1, to + 1); k++) {
@@ -53,8 +81,8 @@ export function trace(plot, { x, values, tone, width = 1, dash = [], fill }) {
     else ctx.moveTo(...place);
     open = true;
   }
-  if (fill) {
-    ctx.globalAlpha = fill;
+  if (opacity) {
+    ctx.globalAlpha = opacity;
     ctx.fillStyle = colour(tone);
     ctx.fill();
   } else {
@@ -163,19 +191,9 @@ export function drawNotes(plot, notes) {
   const scale = devicePixelRatio;
   const size = FLAG * scale;
   ctx.save();
-  ctx.fillStyle = ctx.strokeStyle = colour("ink");
-  ctx.lineWidth = scale;
-  ctx.setLineDash([scale, 3 * scale]);
   for (const { left } of flags(plot, notes)) {
-    ctx.beginPath();
-    ctx.moveTo(left, bbox.top);
-    ctx.lineTo(left, bbox.top + bbox.height);
-    ctx.stroke();
-    ctx.beginPath();
-    ctx.moveTo(left, bbox.top);
-    ctx.lineTo(left + size, bbox.top + size / 2);
-    ctx.lineTo(left, bbox.top + size);
-    ctx.fill();
+    stroke(ctx, [[left, bbox.top], [left, bbox.top + bbox.height]], "ink", scale, [scale, 3 * scale]);
+    fill(ctx, [[left, bbox.top], [left + size, bbox.top + size / 2], [left, bbox.top + size]], "ink");
   }
   ctx.restore();
 }
@@ -276,12 +294,7 @@ export function drawOutsiders(plot, series, says) {
   for (const { x, tone, above } of found) {
     const at = plot.valToPos(x, "x", true);
     const [tip, base] = above ? [bbox.top + scale, bbox.top + 2 * size] : [bbox.top + bbox.height - scale, bbox.top + bbox.height - 2 * size];
-    ctx.fillStyle = colour(tone);
-    ctx.beginPath();
-    ctx.moveTo(at, tip);
-    ctx.lineTo(at - size, base);
-    ctx.lineTo(at + size, base);
-    ctx.fill();
+    fill(ctx, [[at, tip], [at - size, base], [at + size, base]], tone);
   }
   for (const { x, value, above } of found.filter((mark) => mark.furthest)) {
     const at = plot.valToPos(x, "x", true);

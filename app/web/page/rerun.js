@@ -93,7 +93,6 @@ const CHANNEL = "nisus";
 const FEED_TIMEOUT_MS = 30000; // ms until bytes must have been taken in
 
 const frame = () => new Promise((resolve) => requestAnimationFrame(resolve));
-const pause = (ms) => new Promise((resolve) => setTimeout(resolve, ms));
 
 function loadScript(url) {
   return new Promise((resolve, reject) => {

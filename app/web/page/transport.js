@@ -1,6 +1,7 @@
 // The bar of time: pause, step, speed, where we are, health and events on a track; click to look there.
 
 import { $, element, setAttribute, setText } from "./dom.js";
+import { colour, fill, fineContext } from "./drawing.js";
 import { clock, span } from "./format.js";
 import { Stream } from "./stream.js";
 import { SIGNS } from "./trust.js";
@@ -13,6 +14,15 @@ const POINTS = 400;
 const NEAR = 6; // px from a note
 
 const offered = ([text, value]) => element("option", { value }, text);
+
+// Choose a value of a list of numbers. Another than those that it has is added in its place among them, and returned.
+function choose(select, value, text) {
+  const known = [...select.options];
+  const added = known.some((option) => option.value === value) ? null : offered([text, value]);
+  if (added) select.insertBefore(added, known.find((option) => !(Number(option.value) < Number(value))));
+  select.value = value;
+  return added;
+}
 
 export class Transport {
   constructor(model, link, view, charts) {
@@ -51,14 +61,10 @@ export class Transport {
     const { view } = this;
     const width = view.following ? view.span : view.until - view.since;
     const value = width === null || this.whole ? "all" : String(Number(width.toPrecision(3)));
-    if (select.value === value) return;
-    const known = [...select.options];
-    if (!known.some((option) => option.value === value)) {
-      this.otherSpan?.remove();
-      this.otherSpan = offered([span(Number(value)), value]);
-      select.insertBefore(this.otherSpan, known.find((option) => !(Number(option.value) < Number(value))));
-    }
-    select.value = value;
+    const added = choose(select, value, span(Number(value)));
+    if (!added) return;
+    this.otherSpan?.remove();
+    this.otherSpan = added;
   }
 
   // Ends of the track in seconds: of the whole recording where that is known.
@@ -116,25 +122,15 @@ export class Transport {
     $("step").hidden = $("speed").hidden = !status.seekable;
     $("step").disabled = !status.paused;
     if (status.seekable && document.activeElement !== $("speed")) {
-      if (ended) this.offerSpeed(String(this.pace));
-      this.offerSpeed(String(status.speed ?? 1));
+      for (const speed of [...(ended ? [this.pace] : []), status.speed ?? 1]) choose($("speed"), String(speed), `${Number(speed).toLocaleString("en")}×`);
     }
     setText($("state"), status.finished ? "ended" : status.paused ? "paused" : "");
     const now = status.origin && status.t !== null ? this.now : NaN;
     setText($("now"), clock(now, 1));
   }
 
-  // A speed from the command line may be another than those of the list.
-  offerSpeed(value) {
-    const known = [...$("speed").options];
-    // In its place among them.
-    if (!known.some((option) => option.value === value)) $("speed").insertBefore(offered([`${Number(value).toLocaleString("en")}×`, value]), known.find((option) => !(Number(option.value) < Number(value))));
-    $("speed").value = value;
-  }
-
   get now() {
-    const { x } = this.stream;
-    return x.length ? x[x.length - 1] : NaN;
+    return this.stream.x.at(-1) ?? NaN;
   }
 
   draw() {
@@ -148,27 +144,18 @@ export class Transport {
     const seconds = Math.min(this.view.at ?? Infinity, Number.isFinite(this.now) ? this.now : from);
     const values = { "aria-valuemin": Math.floor(from), "aria-valuemax": Math.ceil(to), "aria-valuenow": Math.round(seconds), "aria-valuetext": clock(seconds) };
     for (const [name, value] of Object.entries(values)) setAttribute(canvas, name, value);
-    const [width, height] = [canvas.clientWidth, canvas.clientHeight];
-    const ratio = devicePixelRatio;
-    if (canvas.width !== Math.round(width * ratio) || canvas.height !== Math.round(height * ratio)) {
-      canvas.width = Math.round(width * ratio);
-      canvas.height = Math.round(height * ratio);
-    }
-    const ctx = canvas.getContext("2d");
-    ctx.setTransform(ratio, 0, 0, ratio, 0, 0);
-    ctx.clearRect(0, 0, width, height);
-    const style = getComputedStyle(document.documentElement);
-    const tone = (name) => style.getPropertyValue(`--${name}`).trim();
+    const width = canvas.clientWidth;
+    const ctx = fineContext(canvas);
     const [start, end] = this.ends;
     const place = (seconds) => ((seconds - start) / (end - start)) * width;
-    ctx.fillStyle = tone("rule");
+    ctx.fillStyle = colour("rule");
     ctx.fillRect(0, 14, width, 10);
     const { x } = this.stream;
     const health = this.stream.column("health");
     for (let k = 0; k < x.length; ) {
       let next = k + 1;
       while (next < x.length && health[next] === health[k]) next += 1;
-      ctx.fillStyle = tone(`health-${HEALTH[health[k]] ?? "waiting"}`);
+      ctx.fillStyle = colour(`health-${HEALTH[health[k]] ?? "waiting"}`);
       const until = next < x.length ? place(x[next]) : place(x[x.length - 1]);
       ctx.fillRect(place(x[k]), 14, Math.max(1, until - place(x[k])), 10);
       k = next;
@@ -176,27 +163,23 @@ export class Transport {
     ctx.font = "11px system-ui, sans-serif";
     ctx.textAlign = "center";
     for (const episode of this.episodes) {
-      ctx.fillStyle = tone(episode.grade === "advisory" ? "health-advisory" : "ink");
+      ctx.fillStyle = colour(episode.grade === "advisory" ? "health-advisory" : "ink");
       ctx.fillText("▾", Math.min(width - 5, Math.max(5, place(episode.from))), 12);
     }
-    ctx.fillStyle = tone("ink");
     // Notes of users: flags below the track.
     for (const { from } of this.charts.notes) {
       const left = Math.min(width - 5, Math.max(0, place(from)));
-      ctx.beginPath();
-      ctx.moveTo(left, 26);
-      ctx.lineTo(left + 6, 29);
-      ctx.lineTo(left, 32);
-      ctx.fill();
+      fill(ctx, [[left, 26], [left + 6, 29], [left, 32]], "ink");
     }
+    ctx.fillStyle = colour("ink");
     // What the charts show.
     const [since, until] = this.charts.range;
-    ctx.strokeStyle = tone("ink");
+    ctx.strokeStyle = colour("ink");
     ctx.lineWidth = 1.5;
     const left = Math.max(0, place(since));
     ctx.strokeRect(left + 0.75, 11.75, Math.max(3, Math.min(width, place(until)) - left - 1.5), 14.5);
     if (this.view.at !== null) ctx.fillRect(Math.min(width - 2, Math.max(0, place(this.view.at) - 1)), 8, 2, 22);
-    ctx.fillStyle = tone("faint");
+    ctx.fillStyle = colour("faint");
     ctx.textAlign = "left";
     ctx.fillText(clock(start), 0, 38);
     ctx.textAlign = "right";

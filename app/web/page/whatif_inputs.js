@@ -2,7 +2,7 @@
 
 import { line } from "./chart.js";
 import { element } from "./dom.js";
-import { colour } from "./drawing.js";
+import { colour, fill, stroke } from "./drawing.js";
 import { bracketed, compact, span, words } from "./format.js";
 import { Range, extent, shownExtent, within } from "./ranges.js";
 
@@ -143,20 +143,11 @@ export function probability(plot, times, found) {
   const { ctx, bbox } = plot;
   const foot = bbox.top + bbox.height;
   const place = (share, k) => [plot.valToPos(times[k], "x", true), foot - SURE * bbox.height * share];
+  const curve = found.probability.map((share, k) => place(share ?? 0, k));
+  const [x, y] = curve.at(-1);
   ctx.save();
-  ctx.setLineDash([]);
-  ctx.beginPath();
-  ctx.moveTo(plot.valToPos(times[0], "x", true), foot);
-  found.probability.forEach((share, k) => ctx.lineTo(...place(share ?? 0, k)));
-  ctx.lineTo(plot.valToPos(times.at(-1), "x", true), foot);
-  ctx.fillStyle = colour("bounds");
-  ctx.fill();
-  ctx.beginPath();
-  found.probability.forEach((share, k) => ctx.lineTo(...place(share ?? 0, k)));
-  ctx.strokeStyle = colour("ink");
-  ctx.lineWidth = devicePixelRatio;
-  ctx.stroke();
-  const [x, y] = place(found.probability.at(-1) ?? 0, times.length - 1);
+  fill(ctx, [[curve[0][0], foot], ...curve, [x, foot]], "bounds");
+  stroke(ctx, curve, "ink");
   ctx.fillStyle = colour("faint");
   ctx.font = `${11 * devicePixelRatio}px system-ui, sans-serif`;
   ctx.textAlign = "right";
@@ -169,22 +160,13 @@ export function probability(plot, times, found) {
 export function levels(plot, now, limit) {
   const { ctx, bbox } = plot;
   ctx.save();
-  ctx.lineWidth = devicePixelRatio;
-  const draw = (name, dash, ...points) => {
-    ctx.strokeStyle = colour(name);
-    ctx.setLineDash(dash.map((length) => length * devicePixelRatio));
-    ctx.beginPath();
-    ctx.moveTo(...points[0]);
-    ctx.lineTo(...points[1]);
-    ctx.stroke();
-  };
   if (now !== undefined) {
     const x = plot.valToPos(now, "x", true);
-    draw("faint", [], [x, bbox.top], [x, bbox.top + bbox.height]);
+    stroke(ctx, [[x, bbox.top], [x, bbox.top + bbox.height]], "faint");
   }
   if (limit !== undefined) {
     const y = plot.valToPos(limit, "y", true);
-    draw("ink", [8, 4], [bbox.left, y], [bbox.left + bbox.width, y]);
+    stroke(ctx, [[bbox.left, y], [bbox.left + bbox.width, y]], "ink", devicePixelRatio, [8 * devicePixelRatio, 4 * devicePixelRatio]);
   }
   ctx.restore();
 }

@@ -2,7 +2,7 @@
 
 import { multiples, rounded } from "./chart.js";
 import { element } from "./dom.js";
-import { clipped, colour } from "./drawing.js";
+import { clipped, colour, fineContext, stroke } from "./drawing.js";
 import { bracketed, compact, words } from "./format.js";
 import { within } from "./ranges.js";
 import { Stream } from "./stream.js";
@@ -70,12 +70,7 @@ export class XY {
   draw() {
     const { canvas } = this;
     if (!this.shown || !canvas.clientWidth) return;
-    const [width, height] = [canvas.clientWidth, canvas.clientHeight];
-    canvas.width = width * devicePixelRatio;
-    canvas.height = height * devicePixelRatio;
-    const ctx = canvas.getContext("2d");
-    ctx.scale(devicePixelRatio, devicePixelRatio);
-    const belief = this.paint(ctx, width, height);
+    const belief = this.paint(fineContext(canvas), canvas.clientWidth, canvas.clientHeight);
     const { withheld } = this.charts;
     const hidden = this.pair.filter((name) => withheld?.[name]).map((name) => `${words(name)} withheld: ${withheld[name]}`);
     this.text.textContent = belief ? `correlation ${compact(belief.cov[1] / Math.sqrt(belief.cov[0] * belief.cov[2]), 2)}` : hidden.join("; ");
@@ -167,27 +162,16 @@ class Axes {
     const [right, bottom] = [this.width - ROOM.right, this.height - ROOM.bottom];
     for (const value of ticks(...this.spans[0], 4)) {
       const [x] = this.place([value, 0]);
-      this.line([[x, ROOM.top], [x, bottom]], "grid");
+      stroke(this.ctx, [[x, ROOM.top], [x, bottom]], "grid", 1);
       this.text(compact(value), [x, bottom + 13]);
     }
     for (const value of ticks(...this.spans[1], 5)) {
       const [, y] = this.place([0, value]);
-      this.line([[ROOM.left, y], [right, y]], "grid");
+      stroke(this.ctx, [[ROOM.left, y], [right, y]], "grid", 1);
       this.text(compact(value), [ROOM.left - 5, y + 4], "right");
     }
     this.text(this.labels[0], [(ROOM.left + right) / 2, this.height - 5]);
     this.text(this.labels[1], [10, (ROOM.top + bottom) / 2], "center", true);
-  }
-
-  line(points, tone, width = 1, dash = []) {
-    const { ctx } = this;
-    ctx.strokeStyle = colour(tone);
-    ctx.lineWidth = width;
-    ctx.setLineDash(dash);
-    ctx.beginPath();
-    for (const point of points) ctx.lineTo(...point);
-    ctx.stroke();
-    ctx.setLineDash([]);
   }
 
   text(words, [x, y], align = "center", upright = false) {
@@ -202,7 +186,7 @@ class Axes {
   }
 
   curve(points, tone, width, dash) {
-    this.line(points.map((point) => this.place(point)), tone, width, dash);
+    stroke(this.ctx, points.map((point) => this.place(point)), tone, width, dash);
   }
 
   dots(points, tone, radius) {
