@@ -237,7 +237,7 @@ function frame([x0, x1], [y0, y1], label, { xs = [], ys = [] } = {}) {
     node.append(svg("line", { class: "grid", x1: LEFT, x2: W - RIGHT, y1: y(value), y2: y(value) }));
     node.append(svg("text", { x: LEFT - 4, y: y(value) + 3.5, "text-anchor": "end" }, text ?? compact(value, 3)));
   }
-  for (const [value, text] of xs) node.append(svg("text", { x: x(value), y: H - 5, "text-anchor": "middle" }, text ?? compact(value, 3)));
+  for (const [value, text, anchor = "middle"] of xs) node.append(svg("text", { x: x(value), y: H - 5, "text-anchor": anchor }, text));
   return { node, x, y };
 }
 
@@ -263,8 +263,7 @@ function stems({ r, bound }, label, step) {
   const known = r.filter((value) => value !== null);
   const most = Math.max(0.3, ...known.map(Math.abs));
   const end = r.length;
-  const { node, x, y } = frame([0, end], [-most, most], label, { xs: [[end / 2, `${compact((end / 2) * step, 2)} s`], [end, `${compact(end * step, 2)} s`]], ys: [[-most], [0], [most]].map(([v]) => [v, compact(v, 2)]) });
-  node.lastChild.setAttribute("text-anchor", "end");
+  const { node, x, y } = frame([0, end], [-most, most], label, { xs: [[end / 2, `${compact((end / 2) * step, 2)} s`], [end, `${compact(end * step, 2)} s`, "end"]], ys: [[-most], [0], [most]].map(([v]) => [v, compact(v, 2)]) });
   if (bound !== null) node.append(svg("rect", { class: "bounds", x: x(0), width: x(end) - x(0), y: y(bound), height: y(-bound) - y(bound) }));
   r.forEach((value, k) => {
     if (value !== null) node.append(svg("line", { class: "stem", x1: x(k + 1), x2: x(k + 1), y1: y(0), y2: y(value) }));
@@ -296,10 +295,7 @@ function flat({ counts, low, high }, label) {
 function coverage({ t, share }, label) {
   const low = Math.min(0.8, ...share.map(([value, under]) => under ?? value));
   const [from, to] = [t[0]?.[0] ?? 0, t.at(-1)?.[1] ?? 1];
-  const { node, x, y } = frame([from, to], [Math.max(0, low - 0.02), 1], label, { xs: [[from, `−${span(to - from)}`], [to, "now"]], ys: [[0.95, "95"], [1, ""], [low, String(Math.round(100 * low))]] });
-  const texts = node.querySelectorAll('text[text-anchor="middle"]');
-  texts[0]?.setAttribute("text-anchor", "start");
-  texts[1]?.setAttribute("text-anchor", "end");
+  const { node, x, y } = frame([from, to], [Math.max(0, low - 0.02), 1], label, { xs: [[from, `−${span(to - from)}`, "start"], [to, "now", "end"]], ys: [[0.95, "95"], [1, ""], [low, String(Math.round(100 * low))]] });
   node.append(svg("line", { class: "expected", x1: x(from), x2: x(to), y1: y(0.95), y2: y(0.95) }));
   share.forEach(([value, under, over], k) => {
     const middle = x((t[k][0] + t[k][1]) / 2);
@@ -314,10 +310,7 @@ function decades(t, lines, most, label, ends) {
   const log = (value) => Math.log10(Math.max(1, value));
   const top = log(most || Math.max(...lines.flatMap(([values]) => values)));
   const ticks = Array.from({ length: Math.floor(top) + 1 }, (_, k) => [k, k < 3 ? String(10 ** k) : `${10 ** (k - 3)}k`]);
-  const { node, x, y } = frame([t[0], t.at(-1)], [0, top || 1], label, { xs: [[t[0], ends[0]], [t.at(-1), ends[1]]], ys: ticks });
-  const texts = node.querySelectorAll('text[text-anchor="middle"]');
-  texts[0]?.setAttribute("text-anchor", "start");
-  texts[1]?.setAttribute("text-anchor", "end");
+  const { node, x, y } = frame([t[0], t.at(-1)], [0, top || 1], label, { xs: [[t[0], ends[0], "start"], [t.at(-1), ends[1], "end"]], ys: ticks });
   for (const [values, kind] of lines) {
     const points = values.flatMap((value, k) => (value === null ? [] : [[x(t[k]), y(log(value))]]));
     node.append(svg("path", { class: kind, d: path(points) }));

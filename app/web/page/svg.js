@@ -1,5 +1,6 @@
 // Drawings as SVG files: a context that records what is drawn on it, and plots that are SVG already. In the light theme.
 
+import { element } from "./dom.js";
 import { inLight, lightPalette } from "./drawing.js";
 
 const FAMILY = "system-ui, -apple-system, 'Segoe UI', Roboto, sans-serif";
@@ -74,22 +75,6 @@ class SvgContext {
     this.path = new SvgPath();
   }
 
-  moveTo(...place) {
-    this.path.moveTo(...place);
-  }
-
-  lineTo(...place) {
-    this.path.lineTo(...place);
-  }
-
-  rect(...place) {
-    this.path.rect(...place);
-  }
-
-  arc(...place) {
-    this.path.arc(...place);
-  }
-
   clip(path = this.path) {
     const within = this.clipId === null ? "" : ` clip-path="url(#frame${this.clipId})"`;
     this.clips.push(`<clipPath id="frame${this.clips.length}"${within}><path d="${path.d}"/></clipPath>`);
@@ -133,6 +118,12 @@ class SvgContext {
     this.parts.push(`<${tag} ${attributes}${clip}${alpha}${moved}/>`);
   }
 }
+
+// What draws a path adds to the one that was begun.
+for (const name of ["moveTo", "lineTo", "rect", "arc"])
+  SvgContext.prototype[name] = function (...place) {
+    this.path[name](...place);
+  };
 
 const HEAD_PX = 50; // px for title, smaller line and legend
 
@@ -227,22 +218,12 @@ export function plotSvg(node, [title, about]) {
     part.removeAttribute("class");
   }
   copy.remove();
-  const root = document.createElementNS("http://www.w3.org/2000/svg", "svg");
-  const wide = Math.max(width, 12 + BOLD * TITLE * title.length);
-  const size = { viewBox: `0 0 ${wide} ${height + PLOT_HEAD}`, width: Math.round(WIDE * wide), height: Math.round(WIDE * (height + PLOT_HEAD)) };
-  for (const [name, value] of Object.entries(size)) root.setAttribute(name, value);
-  root.setAttribute("font-family", FAMILY);
-  const put = (name, attributes, text = "") => {
-    const made = document.createElementNS(root.namespaceURI, name);
-    for (const [key, value] of Object.entries(attributes)) made.setAttribute(key, value);
-    made.textContent = text;
-    root.append(made);
-    return made;
-  };
-  put("title", {}, title);
-  put("rect", { width: wide, height: height + PLOT_HEAD, fill: palette.get("--panel") });
-  put("text", { x: 6, y: 13, "font-size": TITLE, "font-weight": 650, fill: palette.get("--ink") }, title);
-  put("text", { x: 6, y: 25, "font-size": 6.5, fill: palette.get("--faint") }, about);
-  put("g", { transform: `translate(0 ${PLOT_HEAD})` }).append(...copy.childNodes);
+  const [wide, high] = [Math.max(width, 12 + BOLD * TITLE * title.length), height + PLOT_HEAD];
+  const root = element("svg:svg", { viewBox: `0 0 ${wide} ${high}`, width: Math.round(WIDE * wide), height: Math.round(WIDE * high), "font-family": FAMILY },
+    element("svg:title", {}, title),
+    element("svg:rect", { width: wide, height: high, fill: palette.get("--panel") }),
+    element("svg:text", { x: 6, y: 13, "font-size": TITLE, "font-weight": 650, fill: palette.get("--ink") }, title),
+    element("svg:text", { x: 6, y: 25, "font-size": 6.5, fill: palette.get("--faint") }, about),
+    element("svg:g", { transform: `translate(0 ${PLOT_HEAD})` }, ...copy.childNodes));
   return new XMLSerializer().serializeToString(root);
 }
