@@ -4,6 +4,7 @@
 import { changed, element, setText } from "./dom.js";
 import { clock, compact, count, span, spaced } from "./format.js";
 import { get, post } from "./http.js";
+import { nearest } from "./ranges.js";
 
 const RECORDING = ".rrd";
 const DATABASE = ".dbc";
@@ -464,17 +465,6 @@ export class LogView {
     const found = await get("api/gallery/log/draft");
     if (this.name) this.follow(found.state ? found : last);
   }
-}
-
-// Index of the value nearest to x in an ordered array.
-function nearest(t, x) {
-  let [low, high] = [0, t.length - 1];
-  while (high - low > 1) {
-    const middle = (low + high) >> 1;
-    if (t[middle] < x) low = middle;
-    else high = middle;
-  }
-  return x - t[low] < t[high] - x ? low : high;
 }
 
 // The quick chart of a row: its curve, the scale at the left, and the time below if it is tall.

@@ -88,6 +88,12 @@ export function within(x, [since, until]) {
   return [bisect(x, since), Math.max(0, bisect(x, until) - 1)];
 }
 
+// Index of the one of ascending values that is nearest.
+export function nearest(x, value) {
+  const above = bisect(x, value);
+  return above > 0 && value - x[above - 1] < x[above] - value ? above - 1 : above;
+}
+
 function bisect(x, value) {
   let low = 0;
   let high = x.length;

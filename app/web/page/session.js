@@ -2,6 +2,7 @@
 
 import { $, element, setAttribute, setText, showText } from "./dom.js";
 import { drops } from "./dropped_log.js";
+import { count } from "./format.js";
 import { get, post } from "./http.js";
 
 const REST = 700; // ms
@@ -59,8 +60,6 @@ export const progress = ({ doing, seconds }) => `${doing || "starting"} … ${Ma
 
 // One twin of the gallery: picture, question, lesson, and a button to start it, or the reason why it cannot.
 
-const many = (count, word) => `${count.toLocaleString("en")} ${word}${count === 1 ? "" : "s"}`;
-
 // The name of a twin without folder and ending, as its page and its links have it; and the card of that name that can
 // be started, if there is one.
 const brief = (name) => name.split(/[\\/]/).pop().replace(/\.ya?ml$/, "");
@@ -71,7 +70,7 @@ export function card(item, act) {
   const short = brief(item.name);
   const ready = !item.missing && !item.error;
   const button = element("button", { type: "button", class: "start", onclick: () => (button.dataset.runs === "true" ? act.open() : act.start(item.name)) }, "Start");
-  const facts = item.error ? "" : [item.source, many(item.states, "state"), many(item.rows, "row"), item.estimator].join(" · ");
+  const facts = item.error ? "" : [item.source, count(item.states, "state"), count(item.rows, "row"), item.estimator].join(" · ");
   const node = element(
     "li", { class: "card", dataset: { ready: String(ready), name: item.name, ...(item.log ? { log: "true" } : {}) } },
     picture(item),
