@@ -21,7 +21,7 @@
 
 import { element, setAttribute, setText } from "./dom.js";
 import { colour, drawNotes, drawOutsiders, trace, writeNotes } from "./drawing.js";
-import { bracketed, clock, compact, decimals, fixed } from "./format.js";
+import { bracketed, clock, compact, decimals, fixed, spaced } from "./format.js";
 import { within } from "./ranges.js";
 import { drawnOn, svgFile } from "./svg.js";
 
@@ -77,12 +77,10 @@ function thin(self) {
 export const band = (tone, upper, lower) => ({ tone, edges: [upper, lower] });
 
 // "magnet [°C]"
-export const heading = (what) => `${what.title} ${bracketed(what.unit.replace(/^\[|\]$/g, ""))}`.trim();
+export const heading = (what) => `${what.title} ${bracketed(what.unit)}`.trim();
 
 // kinds: modules of the folder charts. Gives the declarations of all charts, from top to bottom; see chart.js.
 export const declared = (kinds, context) => kinds.toSorted((a, b) => a.order - b.order).flatMap((kind) => kind.default(context));
-
-const plain = (unit) => (unit ?? "").replace(/^\[|\]$/g, "");
 
 export class Chart {
   // select(since, until), home(), wheel(event, plot), save(chart, button), note(seconds, there), hover(seconds): on gestures
@@ -94,7 +92,7 @@ export class Chart {
     this.grade = element("span", { class: "grade", hidden: true });
     this.head = element(
       "header", {},
-      this.grade, element("h3", {}, what.title), element("span", { class: "unit" }, what.unit ?? ""),
+      this.grade, element("h3", {}, what.title), element("span", { class: "unit" }, bracketed(what.unit)),
       what.note ? element("span", { class: "note" }, what.note) : null,
       what.control ?? null, this.ramp ?? null,
       element("span", { class: "space" }), this.reading,
@@ -225,7 +223,7 @@ export class Chart {
     const text = (end) => (high > low && compact(low, 3) === compact(high, 3) ? fixed(end, decimals(high - low)) : compact(end, 3));
     const [from, to] = [low, high].map((end) => (Number.isFinite(end) ? text(end) : ""));
     setText(this.ramp.firstChild, from);
-    setText(this.ramp.lastChild, to && `${to} ${plain(this.what.unit)}`.trim());
+    setText(this.ramp.lastChild, to && `${to}${spaced(this.what.unit)}`);
     setAttribute(this.ramp, "aria-label", `Colours of ${heading(this.what)}: ${this.ramp.firstChild.textContent} to ${this.ramp.lastChild.textContent}`);
     setAttribute(this.ramp, "title", this.ramp.ariaLabel);
   }
@@ -267,7 +265,7 @@ export class Chart {
 
   // A value of the value axis as text.
   amount(value) {
-    return this.what.amount?.(value) ?? `${compact(value, 3)} ${plain(this.what.unit)}`.trim();
+    return this.what.amount?.(value) ?? `${compact(value, 3)}${spaced(this.what.unit)}`;
   }
 
   // The chart as the text of an SVG file, as it is shown now, with the texts of notes.

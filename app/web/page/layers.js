@@ -107,7 +107,7 @@ export class Pins {
     const range = new Range();
     this.chart = new Chart(
       {
-        key: "difference", title: "pinned − running", unit: bracketed(this.state.unit), weight: 1,
+        key: "difference", title: "pinned − running", unit: this.state.unit, weight: 1,
         series: { none: { show: false } }, // a value axis needs one
         data: () => ({ x: charts.range }),
         filled: () => this.pinned.some((pin) => pin.less?.x.length),

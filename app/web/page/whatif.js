@@ -4,7 +4,7 @@
 import { Chart, TimeAxis, band, dots, edge, line } from "./chart.js";
 import { element, refusal, setText, showText } from "./dom.js";
 import { aboutMean, unbroken, wrapped } from "./drawing.js";
-import { bracketed, compact, spaced, span, withDeviation } from "./format.js";
+import { compact, spaced, span, withDeviation } from "./format.js";
 import { get, post } from "./http.js";
 import { Range, shownExtent, within } from "./ranges.js";
 import { Stream } from "./stream.js";
@@ -237,7 +237,7 @@ function fan(whatif, state) {
   return {
     key: `whatif:${state.name}`,
     title: state.label,
-    unit: bracketed(state.unit),
+    unit: state.unit,
     note: state.rows.length ? null : "not measured",
     names: { band: "± 1σ, ± 2σ" },
     weight: state.rows.length ? 1 : 1.4,

@@ -3,7 +3,7 @@
 import { line } from "./chart.js";
 import { element } from "./dom.js";
 import { colour, fill, stroke } from "./drawing.js";
-import { bracketed, compact, span, words } from "./format.js";
+import { compact, span, words } from "./format.js";
 import { Range, extent, shownExtent, within } from "./ranges.js";
 
 const KINDS = { hold: "unchanged", constant: "constant", step: "step", ramp: "ramp", repeat: "repeat recording" };
@@ -89,7 +89,7 @@ export function inputChart(whatif, input) {
   return {
     key: `input:${input.name}`,
     title: words(input.name),
-    unit: bracketed(input.unit),
+    unit: input.unit,
     note: "chosen",
     names: { quiet: "recorded", ink: "chosen" },
     weight: 0.7,

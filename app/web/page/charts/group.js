@@ -3,7 +3,7 @@
 
 import { band, edge, line } from "../chart.js";
 import { area, clipped, marks } from "../drawing.js";
-import { bracketed, compact, decimals, fixed, spaced, words } from "../format.js";
+import { compact, decimals, fixed, spaced, words } from "../format.js";
 import { Range, bandExtent, extent, shownExtent, within } from "../ranges.js";
 
 export const order = 1;
@@ -37,7 +37,7 @@ function common(charts, { name, unit, members }) {
   return {
     key: `group:${name}`,
     title: words(name),
-    unit: bracketed(unit),
+    unit,
     columns: members.map((state) => `mean:${state.name}`),
     paint: (plot) => marks(plot, charts, members.flatMap((state) => [state.name, ...state.rows])),
   };

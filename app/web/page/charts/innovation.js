@@ -4,7 +4,7 @@
 import { band, dots, line } from "../chart.js";
 import { element } from "../dom.js";
 import { marks } from "../drawing.js";
-import { bracketed, compact, decimals, fixed, spaced, words } from "../format.js";
+import { compact, decimals, fixed, spaced, words } from "../format.js";
 import { Range, shownExtent, within } from "../ranges.js";
 
 export const order = 4;
@@ -85,7 +85,7 @@ function chartOf(charts, { key, unit, member, rows }, further) {
     key: `innovation:${key}`,
     further,
     title: words(key),
-    unit: bracketed(unit),
+    unit,
     note: "innovation",
     control: member?.field,
     help: "Innovation: measurement minus prediction, and ± 2σ of its predicted size",

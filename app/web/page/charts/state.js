@@ -2,7 +2,7 @@
 
 import { band, dots, edge, line } from "../chart.js";
 import { aboutMean, marks, unbroken, wrapped } from "../drawing.js";
-import { bracketed, compact, decimals, fixed, spaced, withDeviation } from "../format.js";
+import { compact, decimals, fixed, spaced, withDeviation } from "../format.js";
 import { Range, shownExtent, within } from "../ranges.js";
 import { groupsOf } from "./group.js";
 
@@ -45,7 +45,7 @@ function chartOf(charts, state) {
     key: `state:${state.name}`,
     title: state.label,
     state: state.name,
-    unit: bracketed(state.unit),
+    unit: state.unit,
     note: !state.rows.length ? "not measured" : state.rows.length > drawn.length ? `measurements of ${drawn.length} of ${state.rows.length} sensors` : null,
     help: "Estimate ± 2σ; in brackets the protection level: the largest error that one undetected fault can cause",
     weight: state.rows.length || NOISE.test(state.name) || charts.model.states.length > FEW_STATES ? 1 : 1.5,
