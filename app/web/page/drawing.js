@@ -102,7 +102,7 @@ export function area(x, upper, lower) {
 }
 
 // An angle between -π and π; and a curve of such, which leaves the chart at one edge and comes back at the other.
-export const wrapped = (value) => (typeof value === "number" ? value - 2 * Math.PI * Math.round(value / (2 * Math.PI)) : value);
+const wrapped = (value) => (typeof value === "number" ? value - 2 * Math.PI * Math.round(value / (2 * Math.PI)) : value);
 
 export function unbroken(values) {
   let before = NaN;
@@ -116,7 +116,11 @@ export function unbroken(values) {
 }
 
 // The edge of a band of an angle, about its wrapped mean.
-export const aboutMean = (mean, values) => values.map((value, k) => (typeof value === "number" && typeof mean[k] === "number" ? wrapped(mean[k]) + value - mean[k] : value));
+const aboutMean = (mean, values) => values.map((value, k) => (typeof value === "number" && typeof mean[k] === "number" ? wrapped(mean[k]) + value - mean[k] : value));
+
+// Columns of an angle by name, as they are drawn: measurements and curves between -π and π, edges of bands about their mean.
+export const angular = (columns, mean) =>
+  Object.fromEntries(Object.entries(columns).map(([name, values]) => [name, name.includes(":") ? values.map(wrapped) : /(^|_)(upper|lower)/.test(name) ? aboutMean(mean, values) : unbroken(values)]));
 
 // Episodes
 

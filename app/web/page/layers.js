@@ -2,7 +2,7 @@
 // of the states that charts of groups draw strong. Each asks for the same stretch of time as the charts.
 
 import { Chart } from "./chart.js";
-import { aboutMean, unbroken } from "./drawing.js";
+import { angular, unbroken } from "./drawing.js";
 import { $, changed, element, keyed, setText } from "./dom.js";
 import { bracketed, compact } from "./format.js";
 import { Range, extent, within } from "./ranges.js";
@@ -58,12 +58,9 @@ export class Smoothed {
   curves(state) {
     const { x } = this.stream;
     if (!this.on || !x.length) return [];
-    const mean = this.stream.column(`mean:${state.name}`);
-    return ["lower", "upper", "mean"].map((kind) => {
-      const column = this.stream.column(`${kind}:${state.name}`);
-      const values = !state.circular ? column : kind === "mean" ? unbroken(mean) : aboutMean(mean, column);
-      return { legend: kind === "mean" ? "smoothed" : "", tone: "smoothed", width: kind === "mean" ? 1.25 : 0.75, x, values };
-    });
+    const columns = Object.fromEntries(["lower", "upper", "mean"].map((kind) => [kind, this.stream.column(`${kind}:${state.name}`)]));
+    return Object.entries(state.circular ? angular(columns, columns.mean) : columns).map(([kind, values]) =>
+      ({ legend: kind === "mean" ? "smoothed" : "", tone: "smoothed", width: kind === "mean" ? 1.25 : 0.75, x, values }));
   }
 }
 

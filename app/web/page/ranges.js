@@ -88,6 +88,9 @@ export function within(x, [since, until]) {
   return [bisect(x, since), Math.max(0, bisect(x, until) - 1)];
 }
 
+// How many ascending times are before a moment.
+export const until = (x, moment) => (x.length && x[0] <= moment ? within(x, [-Infinity, moment])[1] + 1 : 0);
+
 // Index of the one of ascending values that is nearest.
 export function nearest(x, value) {
   const above = bisect(x, value);

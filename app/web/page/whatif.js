@@ -3,10 +3,10 @@
 
 import { Chart, TimeAxis, band, dots, edge, line } from "./chart.js";
 import { element, refusal, setText, showText } from "./dom.js";
-import { aboutMean, unbroken, wrapped } from "./drawing.js";
+import { angular } from "./drawing.js";
 import { compact, spaced, span, withDeviation } from "./format.js";
 import { get, post } from "./http.js";
-import { Range, shownExtent, within } from "./ranges.js";
+import { Range, shownExtent, until } from "./ranges.js";
 import { Stream } from "./stream.js";
 import { inputChart, inputRow, levels, probability, profile } from "./whatif_inputs.js";
 
@@ -254,14 +254,13 @@ function fan(whatif, state) {
     },
     data: () => {
       const { found, times } = whatif;
-      const count = within(stream.x, [-Infinity, times[0]])[1] + 1;
-      const before = stream.x.length && stream.x[0] <= times[0] ? Math.min(count, stream.x.length) : 0;
+      const before = until(stream.x, times[0]);
       const none = new Array(times.length).fill(null);
       const empty = new Array(before).fill(null);
       const told = found.states[state.name];
-      const was = Object.fromEntries(Object.entries(past).map(([kind, name]) => [kind, stream.column(name).slice(0, before)]));
-      const will = Object.fromEntries(Object.entries(future).map(([kind, name]) => [kind, told[name] ?? none]));
-      if (state.circular) [[was, "mean"], [will, "forecast"]].forEach(([columns, mean]) => turn(columns, mean));
+      const drawn = (columns, mean) => (state.circular ? angular(columns, columns[mean]) : columns);
+      const was = drawn(Object.fromEntries(Object.entries(past).map(([kind, name]) => [kind, stream.column(name).slice(0, before)])), "mean");
+      const will = drawn(Object.fromEntries(Object.entries(future).map(([kind, name]) => [kind, told[name] ?? none])), "forecast");
       return {
         x: [...stream.x.slice(0, before), ...times],
         ...Object.fromEntries(Object.entries(was).map(([name, values]) => [name, [...values, ...none]])),
@@ -284,11 +283,4 @@ function fan(whatif, state) {
       return `in ${span(x - now)} ${withDeviation(mean, (upper - lower) / 2, state.unit)}`;
     },
   };
-}
-
-// Columns of an angle: the edges of bands about their mean, everything else between -π and π.
-function turn(columns, mean) {
-  const center = columns[mean];
-  for (const [name, values] of Object.entries(columns))
-    columns[name] = /^(upper|lower)/.test(name) ? aboutMean(center, values) : name.startsWith("reading:") ? values.map(wrapped) : unbroken(values);
 }

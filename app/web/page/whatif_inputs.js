@@ -4,7 +4,7 @@ import { line } from "./chart.js";
 import { element } from "./dom.js";
 import { colour, fill, stroke } from "./drawing.js";
 import { compact, span, words } from "./format.js";
-import { Range, extent, shownExtent, within } from "./ranges.js";
+import { Range, extent, shownExtent, until } from "./ranges.js";
 
 const KINDS = { hold: "unchanged", constant: "constant", step: "step", ramp: "ramp", repeat: "repeat recording" };
 const POINTS = 100; // of a ramp
@@ -99,7 +99,7 @@ export function inputChart(whatif, input) {
     data: () => {
       const { found, times } = whatif;
       const steps = stairs(found.chosen[input.name], found.inputs[input.name], found.t.at(-1));
-      const before = stream.x.length && stream.x[0] <= times[0] ? within(stream.x, [-Infinity, times[0]])[1] + 1 : 0;
+      const before = until(stream.x, times[0]);
       const was = held(stream.column(`input:${input.name}`).slice(0, before));
       return {
         x: [...stream.x.slice(0, before), ...steps.map(([seconds]) => times[0] + seconds)],

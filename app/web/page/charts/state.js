@@ -1,7 +1,7 @@
 // Each state: estimate and band, truth, the sensors that measure it directly, and what other runs say.
 
 import { band, dots, edge, line } from "../chart.js";
-import { aboutMean, marks, unbroken, wrapped } from "../drawing.js";
+import { angular, marks } from "../drawing.js";
 import { compact, decimals, fixed, spaced, withDeviation } from "../format.js";
 import { Range, shownExtent, within } from "../ranges.js";
 import { groupsOf } from "./group.js";
@@ -62,13 +62,8 @@ function chartOf(charts, state) {
     },
     bands: [band("band", "upper", "lower"), ...(inner.length ? [band("band-noise", ...inner)] : [])],
     data: () => {
-      const columns = Object.fromEntries(Object.entries(own).map(([kind, name]) => [kind, live.column(name)]));
-      const dotted = measured.map((name) => [name, state.circular ? live.column(name).map(wrapped) : live.column(name)]);
-      if (state.circular) {
-        for (const side of ["upper", "lower", ...inner]) columns[side] = aboutMean(columns.mean, columns[side]);
-        for (const kind of ["truth", "mean"]) columns[kind] = unbroken(columns[kind]);
-      }
-      return { x: live.x, ...columns, ...Object.fromEntries(dotted) };
+      const columns = Object.fromEntries([...Object.entries(own), ...measured.map((name) => [name, name])].map(([kind, name]) => [kind, live.column(name)]));
+      return { x: live.x, ...(state.circular ? angular(columns, columns.mean) : columns) };
     },
     curves: () => [
       ...charts.layers.flatMap((layer) => layer.curves(state)),
