@@ -5,7 +5,7 @@ import { Chart } from "./chart.js";
 import { angular, unbroken } from "./drawing.js";
 import { $, changed, element, keyed, setText } from "./dom.js";
 import { bracketed, compact } from "./format.js";
-import { Range, extent, within } from "./ranges.js";
+import { extent, Range, union, within } from "./ranges.js";
 import { Stream } from "./stream.js";
 
 const meanOf = (stream, state) => {
@@ -109,10 +109,7 @@ export class Pins {
         data: () => ({ x: charts.range }),
         filled: () => this.pinned.some((pin) => pin.less?.x.length),
         curves: () => this.curvesOf("less", this.state),
-        range: () => {
-          const [low, high] = this.extent("less", this.state.name, charts.range);
-          return range.fit(Math.min(0, low), Math.max(0, high));
-        },
+        range: () => range.fit(...union([0, 0], this.extent("less", this.state.name, charts.range))),
         says: () => this.read(),
       },
       actions,
@@ -189,11 +186,8 @@ export class Pins {
 
   // Lowest and highest of all pinned runs that is shown of a state.
   extent(which, name, span) {
-    return this.pinned.reduce(([low, high], pin) => {
-      const { x } = pin[which];
-      const [under, over] = x.length ? extent([pin[which].column(`mean:${name}`)], ...within(x, span)) : [Infinity, -Infinity];
-      return [Math.min(low, under), Math.max(high, over)];
-    }, [Infinity, -Infinity]);
+    const streams = this.pinned.map((pin) => pin[which]).filter(({ x }) => x.length);
+    return streams.map((stream) => extent([stream.column(`mean:${name}`)], ...within(stream.x, span))).reduce(union, [Infinity, -Infinity]);
   }
 
   // The axis of a state's chart, widened for them, but not by one that is far off.

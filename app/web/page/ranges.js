@@ -25,6 +25,9 @@ export class Range {
   }
 }
 
+// The span of two spans.
+export const union = ([low, high], [under, over]) => [Math.min(low, under), Math.max(high, over)];
+
 // Lowest and highest of some columns between two indices.
 export function extent(columns, from, to) {
   let low = Infinity;
@@ -60,7 +63,7 @@ export function bandExtent(lower, upper, from, to) {
 export function shownExtent({ lines = [], bands = [], dots = [] }, from, to) {
   const settled = from + Math.ceil(SETTLING * (to - from));
   let [low, high] = extent(lines, settled, to);
-  const take = ([under, over]) => ([low, high] = [Math.min(low, under), Math.max(high, over)]);
+  const take = (other) => ([low, high] = union([low, high], other));
   for (const [lower, upper] of bands) take(bandExtent(lower, upper, from, to));
   take(middle(dots, from, to));
   const reach = FAR * (high - low);

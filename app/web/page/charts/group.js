@@ -4,7 +4,7 @@
 import { band, edge, line } from "../chart.js";
 import { area, clipped, marks } from "../drawing.js";
 import { compact, decimals, fixed, spaced, words } from "../format.js";
-import { Range, bandExtent, extent, shownExtent, within } from "../ranges.js";
+import { bandExtent, extent, Range, shownExtent, union, within } from "../ranges.js";
 
 export const order = 1;
 
@@ -64,9 +64,8 @@ function lines(charts, group) {
       return { x: charts.live.lineTimes, ...columns, furthest: columns[furthest] ?? [] };
     },
     range: (data, span) => {
-      const [low, high] = shownExtent({ lines: members.map((state) => data[state.name]) }, ...within(data.x, span));
-      const [under, over] = furthest === null ? [low, high] : bandExtent(...strong.edges(furthest).toReversed(), ...within(strong.stream.x, span));
-      return range.fit(Math.min(low, under), Math.max(high, over));
+      const shown = shownExtent({ lines: members.map((state) => data[state.name]) }, ...within(data.x, span));
+      return range.fit(...(furthest === null ? shown : union(shown, bandExtent(...strong.edges(furthest).toReversed(), ...within(strong.stream.x, span)))));
     },
     says: (value) => {
       const known = members.map((state) => [value(state.name), state.number]).filter(([number]) => Number.isFinite(number)).sort(([a], [b]) => a - b);

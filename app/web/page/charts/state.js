@@ -3,7 +3,7 @@
 import { band, dots, edge, line } from "../chart.js";
 import { angular, marks } from "../drawing.js";
 import { compact, decimals, fixed, spaced, withDeviation } from "../format.js";
-import { Range, shownExtent, within } from "../ranges.js";
+import { Range, shownExtent, union, within } from "../ranges.js";
 import { groupsOf } from "./group.js";
 
 export const order = 2;
@@ -75,7 +75,7 @@ function chartOf(charts, state) {
       const all = { lines: [data.truth, data.mean], bands: [[data.lower, data.upper]], dots: measured.map((name) => data[name]) };
       const place = within(data.x, span);
       const offset = drawn.map((row) => rejectedExtent(data[`refused:${row}`], data[`reading:${row}`], ...place));
-      const shown = [shownExtent(all, ...place), ...offset].reduce(([low, high], [under, over]) => [Math.min(low, under), Math.max(high, over)]);
+      const shown = offset.reduce(union, shownExtent(all, ...place));
       return axisRange.fit(...charts.layers.reduce((range, layer) => layer.widened?.(range, state, span) ?? range, shown));
     },
     says: (value) => {
