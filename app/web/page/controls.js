@@ -66,6 +66,16 @@ export class Tabs {
   }
 }
 
+// The button between light and dark. turned(): what follows.
+export function themeButton(turned = () => {}) {
+  const root = document.documentElement;
+  $("theme").addEventListener("click", () => {
+    root.dataset.theme = root.dataset.theme === "dark" ? "light" : "dark";
+    localStorage.setItem("nisus.theme", root.dataset.theme);
+    turned();
+  });
+}
+
 // A panel that a button opens beside the Tune column, over the charts, and that stays until it is closed.
 
 export class Panel {

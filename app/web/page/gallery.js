@@ -1,7 +1,7 @@
 // The gallery: every twin with its picture, lesson and question; beside them the recordings. Of a log (#log=NAME) its
 // signals instead.
 
-import { keys } from "./controls.js";
+import { keys, themeButton } from "./controls.js";
 import { $, changed, element, keyed, setAttribute, setText, showText } from "./dom.js";
 import { drops, LogView } from "./dropped_log.js";
 import { compact, count, spaced, span } from "./format.js";
@@ -107,11 +107,7 @@ function when(seconds) {
 const settings = JSON.parse(document.body.dataset.settings);
 const session = new Session(settings.boot);
 
-$("theme").addEventListener("click", () => {
-  const root = document.documentElement;
-  root.dataset.theme = root.dataset.theme === "dark" ? "light" : "dark";
-  localStorage.setItem("nisus.theme", root.dataset.theme);
-});
+themeButton();
 
 let shown = [];
 // A link to a moment of a twin that does not run: the address keeps it for the twin's page.

@@ -1,7 +1,7 @@
 // The page: trust on top, tuning to the left, charts in the middle, scene and lists to the right, time below.
 
 import { Charts } from "./charts.js";
-import { keys, Tabs } from "./controls.js";
+import { keys, Tabs, themeButton } from "./controls.js";
 import { Diagnose } from "./diagnose.js";
 import { $, changed, element, setAttribute, setText, showText } from "./dom.js";
 import { Explore } from "./explore.js";
@@ -23,11 +23,7 @@ import { XY } from "./xy.js";
 const settings = JSON.parse(document.body.dataset.settings);
 const theme = document.documentElement.dataset.theme;
 
-$("theme").addEventListener("click", () => {
-  localStorage.setItem("nisus.theme", theme === "dark" ? "light" : "dark");
-  // Rerun's and Viser's pages take their theme when they start.
-  location.reload();
-});
+themeButton(() => location.reload()); // Rerun's and Viser's pages take their theme when they start
 
 const model = await get("api/model");
 if (model.error) throw new Error(model.error);

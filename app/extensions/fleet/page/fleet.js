@@ -1,6 +1,6 @@
 // The assets of a fleet, the worst first. Only the rows in view are asked for and drawn.
 
-import { keys } from "../page/controls.js";
+import { keys, themeButton } from "../page/controls.js";
 import { $, element, setAttribute, setText, showText } from "../page/dom.js";
 import { bracketed, compact, count, span, withDeviation } from "../page/format.js";
 
@@ -23,11 +23,7 @@ setText($("place"), settings.fleet);
 setText($("about"), `${settings.title} · ${settings.estimator}`);
 document.body.style.setProperty("--columns", `repeat(${states.length}, minmax(110px, 1fr))`);
 
-$("theme").addEventListener("click", () => {
-  const root = document.documentElement;
-  root.dataset.theme = root.dataset.theme === "dark" ? "light" : "dark";
-  localStorage.setItem("nisus.theme", root.dataset.theme);
-});
+themeButton();
 
 // Columns: name of the order, heading, and whether it holds numbers.
 const heads = [
