@@ -1,7 +1,7 @@
 // Diagnose: are the innovations what the filter says they are, is the cloud healthy, what can be told, what could be
 // wrong unnoticed. Small multiples with one sentence each; nothing is asked while this is hidden.
 
-import { changed, element, setText } from "./dom.js";
+import { changed, element, keepFocus, setText } from "./dom.js";
 import { compact, count, inChartTime, spaced, span, words } from "./format.js";
 import { get } from "./http.js";
 
@@ -36,7 +36,7 @@ export class Diagnose {
     clearTimeout(this.timer);
     const found = await get("api/diagnose");
     if (found.error && !this.drawn) setText(this.node, `No answer from the twin: ${found.error}`);
-    else if (!found.error && this.shown && changed(this.node, found)) this.draw(found);
+    else if (!found.error && this.shown && changed(this.node, found)) keepFocus(this.node, "aria-label", () => this.draw(found));
     if (this.shown) this.timer = setTimeout(() => this.ask(), AGAIN);
   }
 
@@ -46,7 +46,6 @@ export class Diagnose {
     const left = found.rows_in_all > found.rows.length ? ` (the first of ${found.rows_in_all})` : "";
     const rows = [...found.rows].sort((a, b) => ORDER.indexOf(a.tone) - ORDER.indexOf(b.tone));
     const open = (row) => this.turned.get(row.name) ?? (found.rows.length <= MAX_OPEN_ROWS || row.tone === "bad");
-    const focused = this.node.contains(document.activeElement) ? document.activeElement.getAttribute("aria-label") : null;
     const cost = found.cost === null ? "" : ` ${compact(found.cost, 3)} µs per event.`;
     this.node.replaceChildren(
       element("p", { class: "summary" }, element("b", {}, `${good} of ${found.rows.length} sensor rows${left} are consistent${but}. `), `Last ${found.events.toLocaleString("en")} events, ${span(found.span)}, ${found.estimator}: ${found.nis}.${cost}`),
@@ -55,7 +54,6 @@ export class Diagnose {
     );
     this.drawn = true;
     this.savable(found.events);
-    if (focused) this.node.querySelector(`[aria-label="${CSS.escape(focused)}"]`)?.focus();
     window.nisus.diagnosed = (window.nisus.diagnosed ?? 0) + 1;
   }
 

@@ -46,6 +46,13 @@ export function changed(node, value) {
   return true;
 }
 
+// Draw anew, and give the focus back to what had it in a node, found by an attribute.
+export function keepFocus(node, attribute, draw) {
+  const focused = node.contains(document.activeElement) ? document.activeElement.getAttribute(attribute) : null;
+  draw();
+  if (focused) node.querySelector(`[${attribute}="${CSS.escape(focused)}"]`)?.focus({ preventScroll: true });
+}
+
 // The text of a node that is hidden while it has none.
 export function showText(node, text) {
   setText(node, text ?? "");

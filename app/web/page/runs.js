@@ -1,7 +1,7 @@
 // A table of all runs, newest first: filter, scores and change of each. Pinned ones stay on the charts; the menu of a row
 // has everything else.
 
-import { element, refusal, showText } from "./dom.js";
+import { element, keepFocus, refusal, showText } from "./dom.js";
 import { bracketed, compact, count, spaced, span, words } from "./format.js";
 import { get, post } from "./http.js";
 import { swatch } from "./layers.js";
@@ -59,12 +59,10 @@ export class Runs {
   }
 
   show() {
-    const focused = this.node.contains(document.activeElement) ? document.activeElement.dataset.focus : null;
     const subjects = [...new Map(this.runs.flatMap((run) => run.score?.fits ?? []).map((fit) => [fit.name, fit])).values()];
     if (!subjects.some((fit) => fit.name === this.subject)) this.subject = (subjects.findLast((fit) => fit.against === "truth") ?? subjects.at(-1))?.name ?? null;
     const best = bests(this.runs, this.subject);
-    this.table.replaceChildren(this.head(subjects), ...[...this.runs].reverse().map((run) => this.run(run, best)));
-    if (focused) this.table.querySelector(`[data-focus="${focused}"]`)?.focus();
+    keepFocus(this.node, "data-focus", () => this.table.replaceChildren(this.head(subjects), ...[...this.runs].reverse().map((run) => this.run(run, best))));
     this.compare();
   }
 
@@ -207,10 +205,8 @@ class Versions {
     this.guard.hidden = !guard.length;
     this.guard.replaceChildren(...guard.map((each) => guarded(each, versions)));
     const differ = this.compared && (await this.difference(this.compared));
-    const focused = this.table.contains(document.activeElement) ? document.activeElement.dataset.focus : null;
     const head = element("tr", {}, element("th", { scope: "col" }, "version"), element("th", { scope: "col", title: "NIS per degree of freedom when it was saved: 1 where the filter is consistent" }, "NIS / dof"), element("th", { scope: "col", title: "Log-likelihood per measurement when it was saved" }, "log L"), element("th", {}));
-    this.table.replaceChildren(element("thead", {}, head), ...versions.map((item) => this.version(item, running, differ)));
-    if (focused) this.table.querySelector(`[data-focus="${focused}"]`)?.focus();
+    keepFocus(this.table, "data-focus", () => this.table.replaceChildren(element("thead", {}, head), ...versions.map((item) => this.version(item, running, differ))));
   }
 
   version(item, running, differ) {

@@ -1,7 +1,7 @@
 // The assets of a fleet, the worst first. Only the rows in view are asked for and drawn.
 
 import { keys, themeButton } from "../page/controls.js";
-import { $, element, setAttribute, setText, showText } from "../page/dom.js";
+import { $, element, keepFocus, setAttribute, setText, showText } from "../page/dom.js";
 import { bracketed, compact, count, span, withDeviation } from "../page/format.js";
 
 const POLL_MS = 1000;
@@ -76,10 +76,8 @@ async function ask(changed = false) {
 const stateText = () => (answer ? ["", count(answer.assets, "asset"), answer.ended ? "source has ended" : "live", answer.stale ? `${count(answer.stale, "late event")} dropped` : null, answer.refused ? count(answer.refused, "problem") : null].filter(Boolean).join(" · ") : "");
 
 function draw({ rows, first, found, assets, counts, histogram, siblings, failure }) {
-  const focused = document.activeElement?.closest("#rows a")?.getAttribute("href");
   $("rows").style.height = `${found * ROW}px`;
-  $("rows").replaceChildren(...rows.map((row, k) => item(row, first + k)));
-  if (focused) [...$("rows").children].find((node) => node.getAttribute("href") === focused)?.focus({ preventScroll: true });
+  keepFocus($("rows"), "href", () => $("rows").replaceChildren(...rows.map((row, k) => item(row, first + k))));
   showText($("none"), found ? "" : assets ? "No asset of that kind." : "No measurements yet.");
   for (const head of $("heads").children) setAttribute(head, "aria-sort", head.dataset.sort && head.dataset.sort === query.sort ? (query.down ? "descending" : "ascending") : null);
   grades(counts, assets);
