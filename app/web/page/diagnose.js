@@ -1,7 +1,7 @@
 // Diagnose: are the innovations what the filter says they are, is the cloud healthy, what can be told, what could be
 // wrong unnoticed. Small multiples with one sentence each; nothing is asked while this is hidden.
 
-import { changed, element, keepFocus, setText } from "./dom.js";
+import { changed, element, keepFocus, setText, table } from "./dom.js";
 import { compact, count, inChartTime, spaced, span, words } from "./format.js";
 import { get } from "./http.js";
 
@@ -210,8 +210,6 @@ function integrityCard({ integrity, unseen_reason: reason }) {
 
 // "4.9e+03 %" as 4900 %.
 const plain = (text) => text.replace(/\d+(\.\d+)?e\+\d+/g, (figures) => String(Math.round(Number(figures))));
-
-const table = (heads, rows) => element("table", {}, element("tr", {}, ...heads.map((head) => element("th", {}, head))), ...rows.map((row) => element("tr", {}, ...row.map((cell) => element("td", {}, cell)))));
 
 // Small plots as SVG, drawn from arrays: bars, stems, points, lines, a map of correlations. Colours are the page's own.
 

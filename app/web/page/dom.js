@@ -46,6 +46,11 @@ export function changed(node, value) {
   return true;
 }
 
+// A table of texts; cells may be elements of their own, such as the names of rows.
+export const table = (heads, rows) => element("table", {},
+  element("thead", {}, element("tr", {}, ...heads.map((head) => element("th", { scope: "col" }, head)))),
+  element("tbody", {}, ...rows.map((cells) => element("tr", {}, ...cells.map((cell) => (cell instanceof Element ? cell : element("td", {}, cell)))))));
+
 // Draw anew, and give the focus back to what had it in a node, found by an attribute.
 export function keepFocus(node, attribute, draw) {
   const focused = node.contains(document.activeElement) ? document.activeElement.getAttribute(attribute) : null;

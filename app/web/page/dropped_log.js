@@ -1,7 +1,7 @@
 // Files dropped on the page: sent in pieces to the folder of recordings, then opened. A recording opens for review; a log
 // opens with its signals, the twins that fit, and a draft of a twin.
 
-import { changed, element, setText } from "./dom.js";
+import { changed, element, setText, table } from "./dom.js";
 import { clock, compact, count, span, spaced } from "./format.js";
 import { get, post } from "./http.js";
 import { nearest } from "./ranges.js";
@@ -222,11 +222,9 @@ export class LogView {
   }
 
   frames(log) {
-    const rows = log.frames.map((one) => element("tr", {}, ...[one.bus, one.id, one.number.toLocaleString("en"), rate(one.rate)].map((text) => element("td", {}, text))));
-    const heads = ["Bus", "Id", "Frames", "Rate"].map((text) => element("th", { scope: "col" }, text));
     return element("details", { class: "frames", open: !log.signals.length },
       element("summary", {}, `${count(log.frames.length, "id")} that no database describes`),
-      element("table", {}, element("thead", {}, element("tr", {}, ...heads)), element("tbody", {}, ...rows)));
+      table(["Bus", "Id", "Frames", "Rate"], log.frames.map((one) => [one.bus, one.id, one.number.toLocaleString("en"), rate(one.rate)])));
   }
 
   // Signals

@@ -1,7 +1,7 @@
 // A table of all runs, newest first: filter, scores and change of each. Pinned ones stay on the charts; the menu of a row
 // has everything else.
 
-import { element, keepFocus, refusal, showText } from "./dom.js";
+import { element, keepFocus, refusal, showText, table } from "./dom.js";
 import { bracketed, compact, count, spaced, span, words } from "./format.js";
 import { get, post } from "./http.js";
 import { swatch } from "./layers.js";
@@ -262,6 +262,5 @@ function guarded(each, versions) {
 // The entries in which two differ: a column for each of the two.
 function differences(names, differ) {
   const shown = (value) => (typeof value === "number" ? compact(value, 6) : value === null ? "off" : String(value));
-  const head = element("tr", {}, ...["entry", ...names].map((text) => element("th", { scope: "col" }, text)));
-  return element("table", {}, element("thead", {}, head), element("tbody", {}, ...differ.map((entry) => element("tr", {}, element("th", { scope: "row" }, entry.key), ...entry.values.map((value) => element("td", {}, shown(value)))))));
+  return table(["entry", ...names], differ.map(({ key, values }) => [element("th", { scope: "row" }, key), ...values.map(shown)]));
 }
