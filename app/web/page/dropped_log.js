@@ -1,103 +1,18 @@
-// Files dropped on the page: sent in pieces to the folder of recordings, then opened. A recording opens for review; a log
-// opens with its signals, the twins that fit, and a draft of a twin.
+// One dropped log: what it holds, its signals, the twins that fit, and a draft of a twin.
 
 import { changed, element, setText, table } from "./dom.js";
-import { clock, compact, count, span, spaced } from "./format.js";
+import { DATABASE } from "./drops.js";
+import { Signals, rate, ROLES } from "./dropped_signals.js";
+import { count, span } from "./format.js";
 import { get, post } from "./http.js";
-import { nearest } from "./ranges.js";
 
-const RECORDING = ".rrd";
-const DATABASE = ".dbc";
 const POLL_MS = 300;
-const OPEN_GROUP_ROWS = 40; // a longer group starts closed
-const PAGE_ROWS = 100; // rows of a group that are added at once
-const CURVE_BATCH = 40;
-const GAP_INTERVALS = 6; // median intervals beyond which a curve is broken
-
-const address = (name) => `gallery#log=${encodeURIComponent(name)}`;
-const ending = (name) => name.slice(name.lastIndexOf(".")).toLowerCase();
-
-// `say` reports progress and errors, `follow` the progress of opening, `show` opens a log where it was dropped.
-export function drops({ say, follow, show = (name) => location.assign(address(name)), described = () => false }) {
-  const over = element("div", { class: "drop-here", hidden: true }, element("p", {}, "Drop to open: a recording for review, a log with its signals, a DBC for CAN logs"));
-  document.body.append(over);
-  let depth = 0;
-  const files = (event) => event.dataTransfer?.types.includes("Files");
-  const cover = (change) => {
-    depth = Math.max(0, depth + change);
-    over.hidden = depth === 0;
-  };
-  addEventListener("dragenter", (event) => files(event) && (event.preventDefault(), cover(1)));
-  addEventListener("dragleave", (event) => files(event) && cover(-1));
-  addEventListener("dragover", (event) => files(event) && event.preventDefault());
-  addEventListener("drop", (event) => {
-    if (!files(event)) return;
-    event.preventDefault();
-    depth = 0;
-    cover(0);
-    const on = event.target.closest?.("[data-log]")?.dataset.name;
-    take([...event.dataTransfer.files], on);
-  });
-
-  // Keep all of them, then open the first recording or log; DBC files go first, so that a log is read with them.
-  async function take(given, twin) {
-    const kept = [];
-    for (const file of given.toSorted((a, b) => (ending(b.name) === DATABASE) - (ending(a.name) === DATABASE))) {
-      say(`${file.name}: sending`);
-      const answer = await send(file, (share) => say(`${file.name}: ${Math.round(100 * share)} %`));
-      if (answer.error) return say(answer.error, true);
-      kept.push(answer.name);
-    }
-    say("");
-    const first = kept.find((name) => ending(name) !== DATABASE);
-    if (first) open(first, twin);
-    else if (kept.length && !described(kept)) say(`${kept.join(", ")} is kept: CAN logs that have its ids are read with it`);
-  }
-
-  async function open(name, twin) {
-    if (ending(name) !== RECORDING && !twin) return show(name);
-    const answer = await post("api/gallery/recordings/open", twin ? { name, twin } : { name });
-    say(answer.error ?? "", Boolean(answer.error));
-    if (!answer.error) follow();
-  }
-  return { take, open };
-}
-
-async function send(file, tell) {
-  const { piece } = await get("api/gallery/recordings");
-  for (let offset = 0; ; offset += piece) {
-    const last = offset + piece >= file.size;
-    const query = new URLSearchParams({ name: file.name, offset, ...(last ? { last: 1 } : {}) });
-    let answer;
-    try {
-      const sent = await fetch(`api/gallery/recordings/drop?${query}`, {
-        method: "POST", headers: { "Content-Type": "application/octet-stream" }, body: file.slice(offset, offset + piece),
-      });
-      answer = await sent.json();
-    } catch {
-      answer = { error: `${file.name}: it could not be sent; check that Nisus runs, and drop it again` };
-    }
-    if (answer.error || last) return answer;
-    tell(Math.min(1, (offset + piece) / file.size));
-  }
-}
-
-const ROLES = [
-  ["state", "State", "measured, with a state of its own"],
-  ["sensor", "Sensor", "another measurement of a state"],
-  ["input", "Input", "known quantity that drives the states"],
-  ["held out", "Held out", "predicted and scored, never used"],
-  ["", "Ignore", "not in the twin"],
-];
-
-const rate = (value) => (value === null ? "" : value >= 0.1 ? `${compact(value, 3)} Hz` : `every ${span(1 / value)}`);
 
 // The view of one log. `ask` has run(log, twin), which starts a twin on it, drop(files), and follow(), which reports how a
 // twin starts.
 export class LogView {
   constructor(node, ask) {
-    Object.assign(this, { node, ask, name: null, rows: new Map() });
-    this.seen = new IntersectionObserver((entries) => this.visible(entries), { root: null, rootMargin: "200px" });
+    Object.assign(this, { node, ask, name: null, roles: new Map() });
   }
 
   get request() {
@@ -107,7 +22,7 @@ export class LogView {
 
   open(name) {
     if (name === this.name) return;
-    Object.assign(this, { name, dbc: null, time: null, unit: "s", zone: null, log: null, roles: new Map(), proposed: null, drafts: false });
+    Object.assign(this, { name, dbc: null, time: null, unit: "s", zone: null, log: null, proposed: null, drafts: false });
     changed(this.node, null);
     this.node.replaceChildren(element("p", { class: "faint reading", role: "status" }, `${name}: reading …`));
     this.read();
@@ -116,7 +31,7 @@ export class LogView {
   close() {
     clearTimeout(this.timer);
     this.name = null;
-    this.seen.disconnect();
+    this.signals?.close();
     this.node.replaceChildren();
   }
 
@@ -128,7 +43,8 @@ export class LogView {
   }
 
   read(change = {}) {
-    Object.assign(this, change, { roles: new Map(), proposed: null });
+    Object.assign(this, change, { proposed: null });
+    this.roles.clear();
     clearTimeout(this.timer);
     this.poll();
   }
@@ -148,8 +64,8 @@ export class LogView {
   draw(log) {
     this.log = log;
     if (changed(this.node, { ...log, roles: null, proposing: null, unproposed: null, draft_name: null })) {
-      this.seen.disconnect();
-      this.rows.clear();
+      this.signals?.close();
+      this.proposed = null;
       this.node.replaceChildren(this.head(log), ...(log.error ? [this.failure(log)] : [this.body(log)]));
     }
     this.propose();
@@ -174,19 +90,13 @@ export class LogView {
   }
 
   body(log) {
-    this.find = element("input", { type: "search", placeholder: "Find a signal", "aria-label": "Find a signal", oninput: () => this.filter() });
-    this.tally = element("span", { class: "faint", role: "status" });
-    this.list = element("div", { class: "signals" });
+    this.signals = new Signals(log, this.request, this.roles, () => this.sum());
     const signals = element("section", { class: "log-signals", "aria-label": "Signals" },
       ...log.faults.filter(() => log.needs !== "time").map((text) => element("p", { class: "note-line" }, text)),
       log.kind === "can_log" ? this.databases(log) : this.times(log),
-      log.signals.length ? element("div", { class: "signals-bar" }, element("h2", {}, "Signals"), this.tally, element("span", { class: "space" }), this.find) : null,
-      this.list,
+      log.signals.length ? this.signals.bar : null,
+      this.signals.list,
       log.frames.length ? this.frames(log) : null);
-    if (log.signals.length) {
-      this.groups = this.grouped(log);
-      this.filter();
-    }
     return element("div", { class: "log-body" }, signals, element("aside", { class: "log-side", "aria-label": "Twins for this log" }, this.drafting(log), ...this.twins(log)));
   }
 
@@ -225,126 +135,6 @@ export class LogView {
     return element("details", { class: "frames", open: !log.signals.length },
       element("summary", {}, `${count(log.frames.length, "id")} that no database describes`),
       table(["Bus", "Id", "Frames", "Rate"], log.frames.map((one) => [one.bus, one.id, one.number.toLocaleString("en"), rate(one.rate)])));
-  }
-
-  // Signals
-
-  grouped(log) {
-    const groups = new Map();
-    log.signals.forEach((signal, index) => {
-      if (!groups.has(signal.group)) groups.set(signal.group, []);
-      groups.get(signal.group).push(index);
-    });
-    // Constants last: they say the least.
-    for (const members of groups.values()) members.sort((a, b) => (log.signals[a].kind === "constant") - (log.signals[b].kind === "constant"));
-    const small = log.signals.length <= 3 * OPEN_GROUP_ROWS;
-    return [...groups].map(([name, members], k) => {
-      const rows = element("div", { class: "rows" });
-      const title = element("span", {}, name || "Columns");
-      const tally = element("span", { class: "faint" });
-      const node = element("details", { class: "group", open: (small || k < 4) && members.length <= OPEN_GROUP_ROWS || groups.size === 1 }, element("summary", {}, title, " ", tally), rows);
-      const group = { name, members, rows, tally, node, matching: members, filled: 0 };
-      node.addEventListener("toggle", () => node.open && !group.filled && this.fill(group));
-      return group;
-    });
-  }
-
-  filter() {
-    const words = this.find.value.toLowerCase().split(/\s+/).filter(Boolean);
-    let left = 0;
-    for (const group of this.groups) {
-      group.matching = group.members.filter((index) => {
-        const text = `${group.name} ${this.log.signals[index].name} ${this.log.signals[index].unit}`.toLowerCase();
-        return words.every((word) => text.includes(word));
-      });
-      left += group.matching.length;
-      group.node.hidden = !group.matching.length;
-      if (words.length && group.matching.length && group.matching.length <= OPEN_GROUP_ROWS) group.node.open = true;
-      setText(group.tally, group.matching.length === group.members.length ? count(group.members.length, "signal") : `${group.matching.length} of ${count(group.members.length, "signal")}`);
-      group.filled = 0;
-      group.rows.replaceChildren();
-      if (group.node.open) this.fill(group);
-    }
-    setText(this.tally, words.length ? `${left} of ${this.log.signals.length}` : String(this.log.signals.length));
-    this.list.replaceChildren(...this.groups.map((group) => group.node));
-  }
-
-  // The next rows of a group.
-  fill(group) {
-    group.rows.querySelector(".more")?.remove();
-    const next = group.matching.slice(group.filled, group.filled + PAGE_ROWS);
-    group.filled += next.length;
-    for (const index of next) {
-      if (!this.rows.has(index)) this.rows.set(index, this.row(index));
-      const row = this.rows.get(index);
-      group.rows.append(row.node);
-      this.seen.observe(row.node);
-    }
-    const more = group.matching.length - group.filled;
-    if (more > 0) group.rows.append(element("button", { type: "button", class: "go more", onclick: () => this.fill(group) }, `Show ${Math.min(more, PAGE_ROWS)} more of ${more}`));
-  }
-
-  row(index) {
-    const signal = this.log.signals[index];
-    const chart = element("div", { class: "spark", tabindex: "0", role: "img", "aria-label": `${signal.name}: ${compact(signal.low)} to ${compact(signal.high)}${spaced(signal.unit)}` });
-    const reading = element("p", { class: "faint readout" }, "");
-    const select = element("select", { "aria-label": `Role of ${signal.name}`, onchange: () => this.choose(index, select.value) },
-      ...ROLES.map(([value, text, title]) => element("option", { value, title }, text)));
-    const facts = [count(signal.number, "value"), rate(signal.rate), signal.missing ? `${signal.missing} missing` : null, signal.kind === "signal" ? null : signal.kind].filter(Boolean).join(" · ");
-    const row = { index, chart, reading, select, curve: null };
-    row.node = element("div", { class: "signal", dataset: { index: String(index), signal: signal.name } },
-      element("div", { class: "what" }, element("b", { title: signal.name }, signal.name), element("span", { class: "unit" }, signal.unit ? ` [${signal.unit}]` : ""), element("p", { class: "faint" }, facts), reading),
-      chart, select);
-    chart.addEventListener("pointermove", (event) => this.point(row, event));
-    chart.addEventListener("pointerleave", () => this.point(row, null));
-    chart.addEventListener("click", () => this.enlarge(row));
-    chart.addEventListener("keydown", (event) => event.key === "Enter" && this.enlarge(row));
-    this.role(row);
-    return row;
-  }
-
-  enlarge(row) {
-    row.node.classList.toggle("tall");
-    plot(row, this.log);
-  }
-
-  // Ask for the curves of rows that come into view, some at a time.
-  visible(entries) {
-    for (const entry of entries) if (entry.isIntersecting) {
-      this.seen.unobserve(entry.target);
-      (this.waiting ??= new Set()).add(Number(entry.target.dataset.index));
-    }
-    if (this.waiting?.size && !this.asking) this.fetchCurves();
-  }
-
-  async fetchCurves() {
-    this.asking = true;
-    const { request, log } = this;
-    while (this.waiting?.size && log === this.log) {
-      const signals = [...this.waiting].slice(0, CURVE_BATCH);
-      for (const index of signals) this.waiting.delete(index);
-      const answer = await post("api/gallery/log/curves", { ...request, signals });
-      if (answer.error || log.name !== this.name) break;
-      signals.forEach((index, k) => {
-        const row = this.rows.get(index);
-        if (row) plot(Object.assign(row, { curve: answer.curves[k] }), log);
-      });
-    }
-    this.asking = false;
-  }
-
-  point(row, event) {
-    const marker = row.chart.querySelector(".marker");
-    if (!row.curve || !marker) return;
-    marker.hidden = !event;
-    if (!event) return setText(row.reading, "");
-    const box = row.chart.querySelector("svg").getBoundingClientRect();
-    const [t, low, high] = row.curve;
-    const at = Math.min(1, Math.max(0, (event.clientX - box.left) / box.width)) * this.log.seconds;
-    const k = nearest(t, at);
-    const signal = this.log.signals[row.index];
-    marker.style.left = `${(100 * t[k]) / (this.log.seconds || 1)}%`;
-    setText(row.reading, `${clock(t[k], this.log.seconds < 60 ? 1 : 0)}  ${low[k] === high[k] ? compact(low[k]) : `${compact(low[k])} to ${compact(high[k])}`}${spaced(signal.unit)}`);
   }
 
   // Twins
@@ -399,28 +189,14 @@ export class LogView {
     if (!this.log.signals?.length || this.proposed === this.name || (!roles && proposing)) return;
     this.proposed = this.name;
     (roles ?? []).forEach(([role], index) => this.roles.has(index) || this.roles.set(index, role));
-    for (const row of this.rows.values()) this.role(row);
-    this.sum();
-  }
-
-  role(row) {
-    const role = this.roles.get(row.index) ?? "";
-    row.node.dataset.role = role;
-    row.select.value = role;
-    const [proposed, reason] = this.log.roles?.[row.index] ?? [];
-    if (reason) row.select.title = `Proposed: ${ROLES.find(([value]) => value === proposed)?.[1] ?? proposed}, ${reason}`;
-  }
-
-  choose(index, role) {
-    this.roles.set(index, role);
-    this.role(this.rows.get(index));
+    this.signals.propose(roles);
     this.sum();
   }
 
   // What the draft will be made of; each name leads to its row.
   sum() {
     const lines = ROLES.slice(0, -1).map(([value, text]) => [text, this.members(value)]).filter(([, members]) => members.length);
-    const link = (index) => element("button", { type: "button", class: "signal-link", onclick: () => this.reveal(index) }, this.log.signals[index].name);
+    const link = (index) => element("button", { type: "button", class: "signal-link", onclick: () => this.signals.reveal(index) }, this.log.signals[index].name);
     this.chosen.replaceChildren(...lines.flatMap(([text, members]) => [element("span", { class: "role" }, element("b", {}, `${text}: `), ...members.slice(0, 12).map(link), members.length > 12 ? ` and ${members.length - 12} more` : null)]));
     const able = this.members("state").length + this.members("sensor").length > 0;
     if (!able) setText(this.chosen, `${this.log.unproposed ? `No roles could be proposed (${this.log.unproposed}). ` : ""}Give at least one signal the role State or Sensor.`);
@@ -429,16 +205,6 @@ export class LogView {
 
   members(role) {
     return [...this.roles].filter(([, other]) => other === role).map(([index]) => index).sort((a, b) => a - b);
-  }
-
-  // Its row, whatever group it is in.
-  reveal(index) {
-    this.find.value = this.log.signals[index].name;
-    this.filter();
-    const group = this.groups.find((item) => item.matching.includes(index));
-    group.node.open = true;
-    if (!group.filled) this.fill(group);
-    this.rows.get(index)?.select.focus();
   }
 
   async draft() {
@@ -463,35 +229,4 @@ export class LogView {
     const found = await get("api/gallery/log/draft");
     if (this.name) this.follow(found.state ? found : last);
   }
-}
-
-// The quick chart of a row: its curve, the scale at the left, and the time below if it is tall.
-function plot(row, log) {
-  if (!row.curve) return;
-  const signal = log.signals[row.index];
-  const [t, low, high] = row.curve;
-  const span_ = log.seconds || 1;
-  const range = signal.high - signal.low || Math.abs(signal.high) || 1;
-  const bottom = signal.high === signal.low ? signal.low - range / 2 : signal.low;
-  const x = (value) => (1000 * value) / span_;
-  const y = (value) => 97 - (94 * (value - bottom)) / range;
-  const apart = t.slice(1).map((value, k) => value - t[k]).sort((a, b) => a - b);
-  const limit = GAP_INTERVALS * Math.max(apart[apart.length >> 1] ?? 0, span_ / 300);
-  let d = "";
-  for (let k = 0; k < t.length; k++) {
-    const at = x(t[k]).toFixed(1);
-    const open = k && t[k] - t[k - 1] <= limit;
-    d += !open ? `M${at} ${y(low[k]).toFixed(1)}` : signal.kind === "switch" ? `H${at}V${y(low[k]).toFixed(1)}` : `L${at} ${y(low[k]).toFixed(1)}`;
-    d += high[k] === low[k] ? (open ? "" : "h.01") : `V${y(high[k]).toFixed(1)}`;
-  }
-  const tall = row.node.classList.contains("tall");
-  const grid = tall ? [0.25, 0.5, 0.75].map((part) => `M${1000 * part} 0V100M0 ${100 * part}H1000`).join("") : "";
-  const path = (name, shape) => element("svg:path", { class: name, d: shape, "vector-effect": "non-scaling-stroke" });
-  const ticks = tall ? [1, 0.5, 0] : [1, 0];
-  const times = tall ? [0, 0.25, 0.5, 0.75, 1] : [];
-  row.chart.replaceChildren(
-    element("div", { class: "levels", "aria-hidden": "true" }, ...ticks.map((part) => element("span", {}, compact(signal.low === signal.high ? signal.low + (part - 0.5) * range : signal.low + part * range, 3)))),
-    element("div", { class: "plot" }, element("svg:svg", { viewBox: "0 0 1000 100", preserveAspectRatio: "none", "aria-hidden": "true" }, path("grid", grid), path("curve", d)), element("i", { class: "marker", hidden: true })),
-    ...(tall ? [element("div", { class: "times", "aria-hidden": "true" }, ...times.map((part) => element("span", {}, clock(part * span_, span_ < 60 ? 1 : 0))))] : []));
-  row.node.dataset.drawn = "true";
 }

@@ -3,7 +3,8 @@
 
 import { keys, themeButton } from "./controls.js";
 import { $, changed, element, keyed, setAttribute, setText, showText } from "./dom.js";
-import { drops, LogView } from "./dropped_log.js";
+import { LogView } from "./dropped_log.js";
+import { drops } from "./drops.js";
 import { compact, count, spaced, span } from "./format.js";
 import { get, post } from "./http.js";
 import { card, progress, Session } from "./session.js";

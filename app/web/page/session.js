@@ -1,7 +1,7 @@
 // State of the session: the running twin, a start under way, a start that failed. Polled while the page is visible.
 
 import { $, element, setAttribute, setText, showText } from "./dom.js";
-import { drops } from "./dropped_log.js";
+import { drops } from "./drops.js";
 import { count } from "./format.js";
 import { get, post } from "./http.js";
 
