@@ -75,14 +75,12 @@ export class Stage {
   }
 
   select({ key, label, options, value }) {
-    const select = element("select", { "aria-label": `Scene: ${label}` });
-    select.append(...options.map((option) => element("option", { value: option }, words(option))));
-    select.value = value;
-    select.addEventListener("change", async () => {
+    const choose = async () => {
       const answer = await post("api/scene", { key, value: select.value });
       select.blur();
       if (!answer.error) this.offer(answer);
-    });
+    };
+    const select = element("select", { "aria-label": `Scene: ${label}`, onchange: choose }, ...options.map((option) => element("option", { value: option, selected: option === value }, words(option))));
     return select;
   }
 }

@@ -39,12 +39,14 @@ $("heads").replaceChildren(...heads.map(([name, text, number]) => {
   return head;
 }));
 
-function sort(name) {
-  query.down = query.sort === name ? !query.down : name !== "asset";
-  query.sort = name;
+// Ask for other rows, from the first one on.
+function choose(change) {
+  Object.assign(query, change);
   $("window").scrollTop = 0;
   ask(true);
 }
+
+const sort = (name) => choose({ sort: name, down: query.sort === name ? !query.down : name !== "asset" });
 
 function visible() {
   const first = Math.max(0, Math.floor($("window").scrollTop / ROW) - SPARE);
@@ -108,7 +110,7 @@ function grades(counts, assets) {
   const list = $("grades");
   const entries = Object.entries(counts);
   if (!list.children.length)
-    list.replaceChildren(...entries.map(([name]) => element("li", {}, element("button", { type: "button", dataset: { health: name }, title: `Show the assets that are ${name}`, onclick: () => choose(name) }, element("span", {}, name), element("i"), element("output")))));
+    list.replaceChildren(...entries.map(([name]) => element("li", {}, element("button", { type: "button", dataset: { health: name }, title: `Show the assets that are ${name}`, onclick: () => choose({ health: query.health === name ? "" : name }) }, element("span", {}, name), element("i"), element("output")))));
   const most = Math.max(1, ...Object.values(counts));
   entries.forEach(([name, number], k) => {
     const button = list.children[k].firstElementChild;
@@ -118,12 +120,6 @@ function grades(counts, assets) {
     setText(button.querySelector("output"), number.toLocaleString("en"));
     setAttribute(button.querySelector("output"), "title", `${compact((100 * number) / Math.max(1, assets), 3)} %`);
   });
-}
-
-function choose(name) {
-  query.health = query.health === name ? "" : name;
-  $("window").scrollTop = 0;
-  ask(true);
 }
 
 function distribution(found) {
@@ -151,11 +147,7 @@ function beside(found) {
   $("differ").disabled = !found.differ && !query.differs;
 }
 
-$("differ").addEventListener("click", () => {
-  query.differs = !query.differs;
-  $("window").scrollTop = 0;
-  ask(true);
-});
+$("differ").addEventListener("click", () => choose({ differs: !query.differs }));
 
 $("column").replaceChildren(...settings.columns.map((name) => element("option", { value: name }, name.replace(/_std$/, " σ").replaceAll("_", " "))));
 $("column").addEventListener("change", () => {
@@ -163,11 +155,7 @@ $("column").addEventListener("change", () => {
   query.differs = false;
   ask(true);
 });
-$("find").addEventListener("input", () => {
-  query.find = $("find").value;
-  $("window").scrollTop = 0;
-  ask(true);
-});
+$("find").addEventListener("input", () => choose({ find: $("find").value }));
 let drawn = 0; // place at which the rows were asked for last
 $("window").addEventListener("scroll", () => {
   const { first } = visible();
