@@ -33,11 +33,7 @@ class Table(Recorded):
 
     Args:
         files: Tables in their order.
-        time_column: Column of the time: numbers in `time_unit`, dates or clocks; or the columns of date and clock.
-        time_unit: s, ms, us, ns, min or h; excel or matlab for the days of a serial date.
-        time_format: Of dates, as in `datetime.strptime`; None detects it.
-        time_zone: Of dates without an offset; None is UTC.
-        time_date: Date of the first row, ISO 8601, if the column holds clocks alone.
+        time: The column that holds the time.
         time_shift: Seconds added to it.
         channels: What feeds the model.
         width: Value columns of an event.
@@ -53,11 +49,7 @@ class Table(Recorded):
         self,
         files: Sequence[str | os.PathLike[str]],
         *,
-        time_column: str | Sequence[str],
-        time_unit: str,
-        time_format: str | None = None,
-        time_zone: str | None = None,
-        time_date: str | None = None,
+        time: TimeColumn,
         time_shift: float = 0.0,
         channels: Iterable[Channel],
         width: int,
@@ -68,21 +60,19 @@ class Table(Recorded):
         if not self._files:
             raise SourceError("table: files is empty; name at least one recording")
         units = [*UNITS, *SERIAL_DAYS]
-        if time_unit not in units:
-            raise SourceError(f"table: the time unit is {time_unit!r}; choose from {', '.join(units)}")
+        if time.unit not in units:
+            raise SourceError(f"table: the time unit is {time.unit!r}; choose from {', '.join(units)}")
         channels = list(channels)
-        name, *clock = [time_column] if isinstance(time_column, str) else time_column
-        self._time = TimeColumn(name, time_unit, time_format, time_zone, clock[0] if clock else None, time_date)
-        self._width, self._report = width, report
+        self._time, self._width, self._report = time, width, report
         self._shift = round(time_shift * 1e9)
         self._columns, self._mapping = mapped(channels, width, report)
         for path in self._files:
-            _check(path, [*self._time.names, *map(column_of, self._columns)])
+            _check(path, [*time.names, *map(column_of, self._columns)])
         self._channels = channels
         self._selectors = _selectors(channels, self._columns)
         self._valued: set[str | TextMatch] = set()
         self._count = 0
-        self._order = Order(self._time.label, time_unit, None if horizon is None else round(horizon * 1e9), report)
+        self._order = Order(time.label, time.unit, None if horizon is None else round(horizon * 1e9), report)
         self._batches = self._all()
 
     def _all(self) -> Generator[Events, None, None]:

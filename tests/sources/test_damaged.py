@@ -17,7 +17,7 @@ from sources.can import log as can_log
 from sources.can.decoder import Decoder
 from sources.can.log import CanLog
 from sources.source import Channel
-from sources.tables.table import Table
+from sources.tables.table import Table, TimeColumn
 from tests.sources import readers_that_fail
 from tests.sources.can.can_tools import Reports, dbc, decoding, sensor
 from tests.sources.can.test_log import decoder_of, messages, read, write  # noqa: F401  a fixture
@@ -152,7 +152,7 @@ def test_flipped_tables_are_read_or_refused(tmp_path, name):
     channels = [Channel(READING, 0, "x", ("x",))]
 
     def open_table(report):
-        return Table([bad], time_column="t", time_unit="s", channels=channels, width=1, report=report)
+        return Table([bad], time=TimeColumn("t"), channels=channels, width=1, report=report)
 
     refused = 0
     for seed in range(25):
@@ -241,6 +241,6 @@ def test_a_column_without_a_value_is_named(tmp_path, ending):
         pq.write_table(pa.table({"t": range(5), "x": range(5), "y": pa.array([None] * 5, pa.float64())}), path)
     reports = Reports()
     channels = [Channel(READING, 0, "x", ("x",)), Channel(READING, 1, "why", ("y",))]
-    read_all(Table([path], time_column="t", time_unit="s", channels=channels, width=1, report=reports))
+    read_all(Table([path], time=TimeColumn("t"), channels=channels, width=1, report=reports))
     assert reports.counts == {"never seen": 1}
     assert reports.texts["never seen"] == f"a{ending}: column 'y' has no value in 5 rows, so why has no values"

@@ -50,7 +50,7 @@ def test_bus_and_gnss_of_one_drive(data):
     from sources.can.decoder import Decoder
     from sources.can.log import CanLog
     from sources.source import Channel
-    from sources.tables.table import Table
+    from sources.tables.table import Table, TimeColumn
 
     folder = data("can_comma2k19_rav4")
     speed = Channel(READING, 0, "speed", ("SPEED",), "SPEED", model_units=("m/s",))
@@ -63,8 +63,8 @@ def test_bus_and_gnss_of_one_drive(data):
                 [folder / "rav4_2018-08-02_seg40.blf"],
                 Decoder([(folder / "dbc" / "toyota_2017.dbc", 0)], [speed], width=2),
             ),
-            Table([folder / "gnss_ublox.csv"], time_column="t_utc", time_unit="s", channels=[fix, ground], width=2),
-            Table([folder / "gnss_qcom.csv"], time_column="t_utc", time_unit="s", channels=[other], width=2),
+            Table([folder / "gnss_ublox.csv"], time=TimeColumn("t_utc"), channels=[fix, ground], width=2),
+            Table([folder / "gnss_qcom.csv"], time=TimeColumn("t_utc"), channels=[other], width=2),
         ]
     )
     got = read_all(merged)

@@ -25,6 +25,7 @@ from .kind import Kind, Opening, blamed, closed, find_recording, matching
 
 if TYPE_CHECKING:
     from sources.source import Channel, Source
+    from sources.tables.times import TimeColumn
 
 
 def _open(opening: Opening) -> Source:
@@ -122,11 +123,7 @@ def _open_table(opening: Opening) -> Source:
     def table(channels: list[Channel]) -> Table:
         return Table(
             files,
-            time_column=section.time.column,
-            time_unit=section.time.unit,
-            time_format=section.time.format,
-            time_zone=section.time.zone,
-            time_date=section.time.date,
+            time=time_column(section),
             time_shift=section.time.shift,
             channels=channels,
             width=opening.model.width,
@@ -137,9 +134,17 @@ def _open_table(opening: Opening) -> Source:
     return blamed(opening, table)
 
 
+def time_column(section: TableSection) -> TimeColumn:
+    """Return the column of a table that holds the time."""
+    from sources.tables.times import TimeColumn
+
+    time = section.time
+    name, *clock = time.column
+    return TimeColumn(name, time.unit, time.format, time.zone, clock[0] if clock else None, time.date)
+
+
 def _follow(opening: Opening, section: TableSection) -> Source:
     from sources.tables.follow import FollowedTable
-    from sources.tables.times import TimeColumn
 
     recorded = [] if section.follow else find_recording(opening.loaded, section, opening.key, None)
     asset = getattr(section, "asset", None)
@@ -148,13 +153,11 @@ def _follow(opening: Opening, section: TableSection) -> Source:
         found = [path for pattern in section.files for path in matching(opening.loaded, section, pattern)]
         return recorded or list(dict.fromkeys(found))
 
-    time, width, report = section.time, opening.model.width, opening.report
+    time, width, report = time_column(section), opening.model.width, opening.report
 
     def table(channels: list[Channel]) -> FollowedTable:
-        name, *clock = time.column
-        column = TimeColumn(name, time.unit, time.format, time.zone, clock[0] if clock else None)
         return FollowedTable(
-            files, time=column, time_shift=time.shift, channels=channels, width=width, report=report,
+            files, time=time, time_shift=section.time.shift, channels=channels, width=width, report=report,
             asset=asset, ends=not section.follow,
         )  # fmt: skip
 

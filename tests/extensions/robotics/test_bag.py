@@ -15,7 +15,7 @@ from sources.formats import files_of, is_recording
 from sources.inspect import inspect_recordings
 from sources.source import Accuracy, Channel, Condition
 from sources.tables.rows import names_of
-from sources.tables.table import Table
+from sources.tables.table import Table, TimeColumn
 from sources.units import heading_unit
 from tests.sources.can.can_tools import Reports, same
 from tests.support import read_all
@@ -36,7 +36,7 @@ WAYS = {
 
 
 def table(files, channels, report=lambda key, text: None, width=2, time="time"):
-    return Table(files, time_column=time, time_unit="s", channels=channels, width=width, report=report)
+    return Table(files, time=TimeColumn(time), channels=channels, width=width, report=report)
 
 
 def reading(index, *columns, **more):

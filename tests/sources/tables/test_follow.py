@@ -73,7 +73,7 @@ def test_random_pieces_of_bytes_give_the_fold_of_the_whole_file(tmp_path, seed):
             file.write(data[at : at + step])
         at += step
         found.append(rest(source))
-    expected = read_all(Table([whole], time_column="t", time_unit="s", channels=[CHANNEL], width=1))
+    expected = read_all(Table([whole], time=TimeColumn("t"), channels=[CHANNEL], width=1))
     assert_same(Events.concat(found, 1)._replace(arrival=expected.arrival), expected)
     assert any("wärmer" in text for text in said) and any("3 cells" in text for text in said)
     log = Log(1)

@@ -15,7 +15,7 @@ from estimators.log import READING
 from sources import inspect
 from sources.formats import is_recording
 from sources.source import Channel
-from sources.tables.table import Table
+from sources.tables.table import Table, TimeColumn
 from tests.sources.can.can_tools import Reports, same
 from tests.support import error_of, read_all
 
@@ -44,7 +44,7 @@ def compress(path, ending):
 
 def table(path, report=lambda key, text: None, columns=("x",)):
     channel = Channel(READING, 0, "x", columns)
-    return Table([path], time_column="t", time_unit="s", channels=[channel], width=len(columns), report=report)
+    return Table([path], time=TimeColumn("t"), channels=[channel], width=len(columns), report=report)
 
 
 @pytest.mark.parametrize("name", ["a.csv", "a.parquet", "a.npz", "a.mat"])

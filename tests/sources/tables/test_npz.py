@@ -36,7 +36,7 @@ def archive(tmp_path):
 
 def table(path, columns, kind=READING):
     channel = Channel(kind, 0, "s", columns, model_units=("K",) * len(columns))
-    return Table([path], time_column="time", time_unit="s", channels=[channel], width=4)
+    return Table([path], time=TimeColumn("time"), channels=[channel], width=4)
 
 
 def test_cells_and_vectors_come_as_they_were_saved(archive, monkeypatch):
@@ -122,7 +122,7 @@ def channels(prefix=""):
 
 
 def matlab(path, prefix="", time="t"):
-    return Table([path], time_column=prefix + time, time_unit="s", channels=channels(prefix), width=1)
+    return Table([path], time=TimeColumn(prefix + time), channels=channels(prefix), width=1)
 
 
 def columns(n, seed=0):
@@ -150,7 +150,7 @@ def test_one_of_many_structs_and_plain_vectors_of_integers(tmp_path):
     got = read_all(matlab(tmp_path / "b.mat", "runs(2)."))
     np.testing.assert_array_equal(got.value[got.kind == INPUT, 0], columns(6, seed=1)["power"])
     only = (Channel(TRUTH, 0, "a", ("a",)),)
-    plain = Table([tmp_path / "b.mat"], time_column="t", time_unit="s", channels=only, width=1)
+    plain = Table([tmp_path / "b.mat"], time=TimeColumn("t"), channels=only, width=1)
     assert read_all(plain).t.tolist() == [0, 10**9, 2 * 10**9, 3 * 10**9]
 
 

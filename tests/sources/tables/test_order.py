@@ -6,7 +6,7 @@ import pytest
 from estimators.log import READING
 from sources.source import WRONG_TIME, Channel, Condition
 from sources.tables.order import BACKWARDS, MAX_EQUAL_TIMES, SORTED, STANDING, Order
-from sources.tables.table import Table
+from sources.tables.table import Table, TimeColumn
 from sources.tables.text import TextMatch
 from tests.sources.can.can_tools import Reports
 from tests.support import SECOND, read_all
@@ -90,7 +90,7 @@ def test_tags_one_after_the_other_are_one_recording(tmp_path):
         for k, tag in enumerate("AB")
     )
     reports = Reports()
-    table = Table([path], time_column="t", time_unit="s", channels=channels, width=1, report=reports, horizon=2.0)
+    table = Table([path], time=TimeColumn("t"), channels=channels, width=1, report=reports, horizon=2.0)
     batch = read_all(table)
     assert set(reports.counts) == {SORTED}
     assert batch.channel.tolist() == [0, 1] * 50
@@ -113,7 +113,7 @@ def test_files_in_a_wrong_order_are_sorted_and_told_with_both(tmp_path):
         (tmp_path / name).write_text("t,x\n" + "".join(f"{start + k},1\n" for k in range(5)))
     reports = Reports()
     files = [tmp_path / "a.csv", tmp_path / "b.csv"]
-    batch = read_all(Table(files, time_column="t", time_unit="s", channels=X, width=1, report=reports, horizon=2.0))
+    batch = read_all(Table(files, time=TimeColumn("t"), channels=X, width=1, report=reports, horizon=2.0))
     assert batch.t.tolist() == [s * SECOND for s in (*range(5), *range(100, 105))]
     assert reports.counts == {SORTED: 5}
     assert reports.texts[SORTED].startswith("b.csv:2: t is 104 s before that of a.csv:6; the rows are out of order")
@@ -124,7 +124,7 @@ def read_table(tmp_path, t):
     path = tmp_path / "pump.csv"
     path.write_text("t,x\n" + "".join(f"{s:.3f},{k}\n" for k, s in enumerate(t)))
     reports = Reports()
-    batch = read_all(Table([path], time_column="t", time_unit="s", channels=X, width=1, report=reports, horizon=2.0))
+    batch = read_all(Table([path], time=TimeColumn("t"), channels=X, width=1, report=reports, horizon=2.0))
     return batch.value[:, 0].astype(int).tolist(), reports
 
 

@@ -42,7 +42,7 @@ def write(folder, text, name="drive.csv"):
 
 def table(path, *, unit="s", channels=CHANNELS, report=lambda key, text: None):
     files = path if isinstance(path, list) else [path]
-    return Table(files, time_column="t", time_unit=unit, channels=channels, width=2, report=report)
+    return Table(files, time=TimeColumn("t", unit), channels=channels, width=2, report=report)
 
 
 X = (Channel(READING, 0, "x", ("x",)),)
@@ -178,10 +178,9 @@ def test_what_is_quoted_from_a_file_is_escaped_and_cut(tmp_path):
 def test_times_are_exact(tmp_path, file, rows, options, assumed, ns):
     """2020-10-25T01:00Z is 1,603,587,600 s, and 2024-03-04 1,709,510,400 s (date -u +%s); a clock passes midnight."""
     rows, expected, reports = rows.split("|"), [int(t) for t in ns.split()], Reports()
-    names = ["t", "u"][: rows[0].count(";") + 1]
-    path = write(tmp_path, "".join([";".join(names), ";x\n", *(f"{cells};1\n" for cells in rows)]), file)
-    options = {"time_unit": "s", **json.loads(options)}
-    got = read_all(Table([path], time_column=names, channels=X, width=1, report=reports, **options))
+    time = TimeColumn("t", clock="u" if ";" in rows[0] else None, **json.loads(options))
+    path = write(tmp_path, "".join([";".join(time.names), ";x\n", *(f"{cells};1\n" for cells in rows)]), file)
+    got = read_all(Table([path], time=time, channels=X, width=1, report=reports))
     counts = {UNDATED: len(rows) - len(expected), ASSUMED: int(assumed)}
     assert (got.t.tolist(), reports.counts) == (expected, {key: count for key, count in counts.items() if count})
 
@@ -262,7 +261,7 @@ def test_only_picks_the_rows_that_speak_of_a_sensor(tmp_path):
 
 def test_a_shift_moves_the_clock(tmp_path):
     path = write(tmp_path, HEADER + "1.5,20,1,2,1,3,7\n")
-    moved = Table([path], time_column="t", time_unit="s", time_shift=-0.2, channels=CHANNELS, width=2)
+    moved = Table([path], time=TimeColumn("t"), time_shift=-0.2, channels=CHANNELS, width=2)
     assert set(read_all(moved).t.tolist()) == {1_300_000_000}
 
 
@@ -336,10 +335,10 @@ def test_text_of_another_encoding_and_units_in_headings(tmp_path):
         Channel(READING, 0, "level", ("Füllstand [mm]",), model_units=("m",)),
         Channel(READING, 1, "count", ("Zähler [raw]",), model_units=("m",)),
     )
-    got = read_all(Table([path], time_column="Zeit", time_unit="s", channels=channels, width=1))
+    got = read_all(Table([path], time=TimeColumn("Zeit"), channels=channels, width=1))
     assert got.value[:, 0].tolist() == [1.5, 7.0]
     own = (Channel(READING, 0, "level", ("Füllstand [mm]",), units=("cm",), model_units=("m",)),)
-    assert read_all(Table([path], time_column="Zeit", time_unit="s", channels=own, width=1)).value.tolist() == [[15.0]]
+    assert read_all(Table([path], time=TimeColumn("Zeit"), channels=own, width=1)).value.tolist() == [[15.0]]
 
 
 TAGS = "t,tag,x,quality\n0,TT101,20.5,Good\n0,PT200,1.5,Good\n1,TT101,99,Bad\n1,PT200,1.6,Good\n2,TT101,21,Uncertain\n"
