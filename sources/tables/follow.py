@@ -92,7 +92,6 @@ class FollowedTable:
     Args:
         files: Returns the present files in their order.
         time: The column that holds the time.
-        time_shift: Seconds added to it.
         channels: What feeds the model.
         width: Value columns of an event.
         report: Called for rows and files that cannot be used, with file and line.
@@ -110,7 +109,6 @@ class FollowedTable:
         files: Callable[[], Sequence[Path]],
         *,
         time: TimeColumn,
-        time_shift: float = 0.0,
         channels: Iterable[Channel],
         width: int,
         report: Report = ignore,
@@ -121,7 +119,7 @@ class FollowedTable:
         self.live = not ends
         self._ends, self._asset = ends, asset
         self._list, self._time, self._width, self._report = files, time, width, report
-        self._shift = round(time_shift * 1e9)
+        self._shift = round(time.shift * 1e9)
         self._columns, self._mapping = mapped(channels, width, report)
         self._read_columns: list[Column] = [*self._columns, *([] if asset is None else [TextCodes(asset)])]
         self._fed = {name: channel.name for channel in channels for name in channel.needed}

@@ -34,7 +34,6 @@ class Table(Recorded):
     Args:
         files: Tables in their order.
         time: The column that holds the time.
-        time_shift: Seconds added to it.
         channels: What feeds the model.
         width: Value columns of an event.
         report: Called for rows without a time and values that are not numbers, with file and line; and once of rows
@@ -50,7 +49,6 @@ class Table(Recorded):
         files: Sequence[str | os.PathLike[str]],
         *,
         time: TimeColumn,
-        time_shift: float = 0.0,
         channels: Iterable[Channel],
         width: int,
         report: Report = ignore,
@@ -64,7 +62,7 @@ class Table(Recorded):
             raise SourceError(f"table: the time unit is {time.unit!r}; choose from {', '.join(units)}")
         channels = list(channels)
         self._time, self._width, self._report = time, width, report
-        self._shift = round(time_shift * 1e9)
+        self._shift = round(time.shift * 1e9)
         self._columns, self._mapping = mapped(channels, width, report)
         for path in self._files:
             _check(path, [*time.names, *map(column_of, self._columns)])

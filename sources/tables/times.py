@@ -58,6 +58,7 @@ class TimeColumn(NamedTuple):
     unit: Of numbers, a key of `UNITS` or `SERIAL_DAYS`. format: Of dates, as in `datetime.strptime`; None detects it.
     zone: Time zone of dates without an offset, for example Europe/Berlin; None is UTC. clock: Second column, of a CSV,
     whose cells follow those of the first. date: ISO date of the first row if the cells are clocks without one.
+    shift: Seconds that a table adds to the times.
     """
 
     name: str
@@ -66,6 +67,7 @@ class TimeColumn(NamedTuple):
     zone: str | None = None
     clock: str | None = None
     date: str | None = None
+    shift: float = 0.0
 
     @property
     def names(self) -> tuple[str, ...]:

@@ -114,17 +114,20 @@ def _sections(section: MergedSection, key: Key) -> dict[Key, Any]:
 
 def _open_table(opening: Opening) -> Source:
     from sources.tables.table import Table
+    from sources.tables.times import TimeColumn
 
     section: TableSection = opening.section
+    own = section.time
+    name, *clock = own.column
+    time = TimeColumn(name, own.unit, own.format, own.zone, clock[0] if clock else None, own.date, own.shift)
     if opening.of_assets or (section.follow and opening.live and opening.log_files is None):
-        return _follow(opening, section)
+        return _follow(opening, section, time)
     files = find_recording(opening.loaded, section, opening.key, opening.log_files)
 
     def table(channels: list[Channel]) -> Table:
         return Table(
             files,
-            time=time_column(section),
-            time_shift=section.time.shift,
+            time=time,
             channels=channels,
             width=opening.model.width,
             report=opening.report,
@@ -134,16 +137,7 @@ def _open_table(opening: Opening) -> Source:
     return blamed(opening, table)
 
 
-def time_column(section: TableSection) -> TimeColumn:
-    """Return the column of a table that holds the time."""
-    from sources.tables.times import TimeColumn
-
-    time = section.time
-    name, *clock = time.column
-    return TimeColumn(name, time.unit, time.format, time.zone, clock[0] if clock else None, time.date)
-
-
-def _follow(opening: Opening, section: TableSection) -> Source:
+def _follow(opening: Opening, section: TableSection, time: TimeColumn) -> Source:
     from sources.tables.follow import FollowedTable
 
     recorded = [] if section.follow else find_recording(opening.loaded, section, opening.key, None)
@@ -153,13 +147,12 @@ def _follow(opening: Opening, section: TableSection) -> Source:
         found = [path for pattern in section.files for path in matching(opening.loaded, section, pattern)]
         return recorded or list(dict.fromkeys(found))
 
-    time, width, report = time_column(section), opening.model.width, opening.report
+    width, report = opening.model.width, opening.report
 
     def table(channels: list[Channel]) -> FollowedTable:
         return FollowedTable(
-            files, time=time, time_shift=section.time.shift, channels=channels, width=width, report=report,
-            asset=asset, ends=not section.follow,
-        )  # fmt: skip
+            files, time=time, channels=channels, width=width, report=report, asset=asset, ends=not section.follow
+        )
 
     return blamed(opening, table)
 

@@ -261,7 +261,7 @@ def test_only_picks_the_rows_that_speak_of_a_sensor(tmp_path):
 
 def test_a_shift_moves_the_clock(tmp_path):
     path = write(tmp_path, HEADER + "1.5,20,1,2,1,3,7\n")
-    moved = Table([path], time=TimeColumn("t"), time_shift=-0.2, channels=CHANNELS, width=2)
+    moved = Table([path], time=TimeColumn("t", shift=-0.2), channels=CHANNELS, width=2)
     assert set(read_all(moved).t.tolist()) == {1_300_000_000}
 
 
