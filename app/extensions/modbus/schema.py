@@ -9,6 +9,10 @@ from pydantic import BeforeValidator, Field, model_validator
 from config.channels import MessagesSection
 from config.fields import Host, Port, Seconds, Section, Text, refused
 
+BIT_TABLES = ("coil", "discrete")
+SIZES = {"int16": 1, "uint16": 1, "int32": 2, "uint32": 2, "int64": 4, "uint64": 4, "float32": 2, "float64": 4}
+"""Registers of a number, by its type."""
+
 
 class RegisterSection(Section):
     """Where a Modbus device has a value."""
@@ -24,9 +28,14 @@ class RegisterSection(Section):
 
     @model_validator(mode="after")
     def _bit(self) -> RegisterSection:
-        if self.table in ("coil", "discrete") and {"type", "words"} & self.model_fields_set:
+        if self.table in BIT_TABLES and {"type", "words"} & self.model_fields_set:
             raise refused("relation", f"is {self.table}, a bit; leave type and words out, or read a register", "table")
         return self
+
+    @property
+    def size(self) -> int:
+        """Registers, or bits, of the value."""
+        return 1 if self.table in BIT_TABLES else SIZES[self.type]
 
 
 def _register(value: Any) -> Any:

@@ -14,7 +14,7 @@ from estimators.errors import ConfigError, printable
 from sources.messages import NO_BROKER, REFUSED, REFUSED_MESSAGE, RETRY_S, Messages
 from sources.source import Report, Source
 
-from .schema import ModbusSourceSection
+from .schema import BIT_TABLES, ModbusSourceSection, RegisterSection
 
 NO_REGISTER = "no register"  # Key of registers that the device does not give
 ANSWER_TIMEOUT_S = 1.0
@@ -22,26 +22,8 @@ ANSWER_TIMEOUT_S = 1.0
 MAX_REGISTERS = 65_536
 """Registers of a table of a Modbus device."""
 
-BIT_TABLES = ("coil", "discrete")
 MAX_COUNT = {"holding": 125, "input": 125, "coil": 2000, "discrete": 2000}
 """Most registers or bits of a request, by table (Modbus Application Protocol 1.1b3, sections 6.1 to 6.4)."""
-
-SIZES = {"int16": 1, "uint16": 1, "int32": 2, "uint32": 2, "int64": 4, "uint64": 4, "float32": 2, "float64": 4}
-"""Registers of a number, by its type."""
-
-
-class Register(NamedTuple):
-    """Where a device has a value: first address from 0, table, type of number, and order of its registers."""
-
-    address: int
-    table: str = "holding"
-    type: str = "uint16"
-    words: str = "big"
-
-    @property
-    def size(self) -> int:
-        """Registers, or bits, of the value."""
-        return 1 if self.table in BIT_TABLES else SIZES[self.type]
 
 
 class Block(NamedTuple):
@@ -53,7 +35,7 @@ class Block(NamedTuple):
     names: tuple[str, ...]
 
 
-def blocks_of(registers: Mapping[str, Register]) -> list[Block]:
+def blocks_of(registers: Mapping[str, RegisterSection]) -> list[Block]:
     """Return the requests: values that are adjacent are read together, so that they are of one moment."""
     found: list[Block] = []
     for name, item in sorted(registers.items(), key=lambda pair: (pair[1].table, pair[1].address)):
@@ -71,26 +53,12 @@ class ModbusSource:
 
     live = utc = True
 
-    def __init__(
-        self,
-        messages: Messages,
-        registers: Mapping[str, Register],
-        *,
-        host: str,
-        port: int,
-        device: int,
-        period: float,
-        report: Report,
-    ) -> None:
+    def __init__(self, messages: Messages, section: ModbusSourceSection, report: Report) -> None:
         """Connect in a thread of its own; a device that is not there is waited for.
 
         Args:
             messages: Takes the values.
-            registers: By the name of the value.
-            host: Name or address of the device.
-            port: Its port.
-            device: Its number behind a gateway (unit identifier).
-            period: Seconds between two readings.
+            section: The device and its registers.
             report: Receives lost connections and refused registers.
 
         Raises:
@@ -101,17 +69,17 @@ class ModbusSource:
         except ModuleNotFoundError:
             raise ConfigError("Modbus needs pymodbus: pip install 'nisus[modbus]'") from None
         logging.getLogger("pymodbus").addHandler(logging.NullHandler())  # what it logs is reported here, in one line
-        self._messages, self._registers, self._report = messages, registers, report
+        self._messages, self._section, self._report = messages, section, report
         self.read, self.now = messages.read, messages.now
-        self._place, self._device, self._period = f"{host}:{port}", device, period
-        self._client: Any = ModbusTcpClient(host, port=port, timeout=ANSWER_TIMEOUT_S, retries=0)
+        self._place = f"{section.host}:{section.port}"
+        self._client: Any = ModbusTcpClient(section.host, port=section.port, timeout=ANSWER_TIMEOUT_S, retries=0)
         self._ask = {
             "holding": self._client.read_holding_registers,
             "input": self._client.read_input_registers,
             "coil": self._client.read_coils,
             "discrete": self._client.read_discrete_inputs,
         }
-        self._blocks = blocks_of(registers)
+        self._blocks = blocks_of(section.registers)
         self.connected = threading.Event()
         """Set while the device answers."""
         self._stopping = threading.Event()
@@ -145,18 +113,18 @@ class ModbusSource:
                 self._report(REFUSED_MESSAGE, f"registers of {self._place}: {answer.reason}; they are not used")
             self.connected.set()
             # A device that is slower than the period is read without pause, but not several times in a row.
-            due = max(due + self._period, time.monotonic())
+            due = max(due + self._section.every, time.monotonic())
 
     def _read(self, block: Block) -> dict[str, float | None]:
-        answer = self._ask[block.table](block.first, count=block.end - block.first, device_id=self._device)
+        answer = self._ask[block.table](block.first, count=block.end - block.first, device_id=self._section.device)
         if not answer.isError():
-            return {name: self._value(self._registers[name], block, answer) for name in block.names}
+            return {name: self._value(self._section.registers[name], block, answer) for name in block.names}
         where = f"{block.table} {block.first} to {block.end - 1}"
         text = f"the device at {self._place} does not give {', '.join(block.names)} ({where}): {answer}"
         self._report(NO_REGISTER, f"{printable(text)}; check address, table and device")
         return dict.fromkeys(block.names)
 
-    def _value(self, item: Register, block: Block, answer: Any) -> float:
+    def _value(self, item: RegisterSection, block: Block, answer: Any) -> float:
         at = item.address - block.first
         if item.table in BIT_TABLES:
             return float(answer.bits[at])
@@ -179,18 +147,9 @@ def open_modbus(opening: Opening) -> Source:
     """
     section: ModbusSourceSection = opening.section
     messages = messages_of(opening, "registers", section.registers)
-    registers = {name: Register(**item.model_dump()) for name, item in section.registers.items()}
-    for name, item in registers.items():
+    for name, item in section.registers.items():
         last = MAX_REGISTERS - item.size
         if item.address > last:
             text = f"is {item.address}; a {item.type} has {item.size} registers, so it is at most {last}"
             raise failure(opening.loaded, (*opening.key, "registers", name, "address"), text)
-    return ModbusSource(
-        messages,
-        registers,
-        host=section.host,
-        port=section.port,
-        device=section.device,
-        period=section.every,
-        report=opening.report,
-    )
+    return ModbusSource(messages, section, opening.report)

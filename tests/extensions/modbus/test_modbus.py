@@ -6,7 +6,8 @@ from contextlib import closing
 import numpy as np
 import pytest
 
-from app.extensions.modbus.source import ModbusSource, Register, blocks_of
+from app.extensions.modbus.schema import ModbusSourceSection
+from app.extensions.modbus.source import ModbusSource, blocks_of
 from estimators.log import READING
 from sources.messages import Messages
 from sources.source import Channel
@@ -25,9 +26,12 @@ def device():
 
 def source(served, registers, report=lambda key, text: None, **given):
     channels = [Channel(READING, k, name, (name,), model_units=("1",)) for k, name in enumerate(registers)]
-    messages = Messages(channels, width=1)
-    options = {"host": "127.0.0.1", "port": served.port, "device": 1, "period": 0.01, "report": report} | given
-    return closing(ModbusSource(messages, registers, **options))
+    section = section_of(registers, port=served.port, every=0.01, **given)
+    return closing(ModbusSource(Messages(channels, width=1), section, report))
+
+
+def section_of(registers, **given):
+    return ModbusSourceSection(type="modbus", host="127.0.0.1", registers=registers, **given)
 
 
 def values(reader, want=1):
@@ -51,7 +55,7 @@ def test_a_number_is_what_the_device_packed(device, kind, code, words):
     if words == "little":  # the registers in reverse, each with its high byte first
         data = b"".join(data[k : k + 2] for k in range(len(data) - 2, -1, -2))
     device.give(7, data, "input")
-    with source(device, {"a": Register(7, "input", kind, words)}, device=9) as reader:
+    with source(device, {"a": {"address": 7, "table": "input", "type": kind, "words": words}}, device=9) as reader:
         assert values(reader) == {0: value}
         assert device.requests[0] == (9, 4, 7, len(data) // 2)
 
@@ -59,25 +63,25 @@ def test_a_number_is_what_the_device_packed(device, kind, code, words):
 def test_bits_are_zero_and_one(device):
     device.tables["coil"] = {k: int(k in (3, 11)) for k in range(16)}
     device.tables["discrete"] = {5: 1}
-    registers = {"off": Register(2, "coil"), "on": Register(3, "coil"), "far": Register(11, "coil")}
-    with source(device, registers | {"other": Register(5, "discrete")}) as reader:
+    registers = {name: {"address": k, "table": "coil"} for name, k in (("off", 2), ("on", 3), ("far", 11))}
+    with source(device, registers | {"other": {"address": 5, "table": "discrete"}}) as reader:
         assert values(reader, 4) == {0: 0.0, 1: 1.0, 2: 1.0, 3: 1.0}
 
 
 def test_adjacent_registers_are_one_request_of_at_most_125():
-    registers = {f"r{k}": Register(k) for k in range(200)} | {"apart": Register(300, type="float64")}
-    spans = [(block.table, block.first, block.end) for block in blocks_of(registers)]
+    registers = {f"r{k}": k for k in range(200)} | {"apart": {"address": 300, "type": "float64"}}
+    spans = [(block.table, block.first, block.end) for block in blocks_of(section_of(registers).registers)]
     assert spans == [("holding", 0, 125), ("holding", 125, 200), ("holding", 300, 304)]
     # Two views of the same registers overlap; other tables are other requests.
-    registers = {"whole": Register(0, type="float64"), "part": Register(1), "bit": Register(1, "coil")}
-    found = [(block.table, block.first, block.end, block.names) for block in blocks_of(registers)]
-    assert found == [("coil", 1, 2, ("bit",)), ("holding", 0, 4, ("whole", "part"))]
+    registers = {"whole": {"address": 0, "type": "float64"}, "part": 1, "bit": {"address": 1, "table": "coil"}}
+    coil, holding = blocks_of(section_of(registers).registers)
+    assert coil == ("coil", 1, 2, ("bit",)) and holding == ("holding", 0, 4, ("whole", "part"))
 
 
 def test_what_the_device_refuses_is_missing_and_told(device):
     told = []
     device.give(1, struct.pack(">H", 42))
-    registers = {"there": Register(1), "not there": Register(50)}
+    registers = {"there": 1, "not there": 50}
     with source(device, registers, lambda *line: told.append(line)) as reader:
         found = values(reader, 2)
         assert found[0] == 42.0 and np.isnan(found[1])
@@ -91,7 +95,7 @@ def test_what_the_device_refuses_is_missing_and_told(device):
 def test_a_device_that_goes_and_comes_back_is_read_again(device):
     told = []
     device.give(1, struct.pack(">H", 1))
-    with source(device, {"a": Register(1)}, lambda *line: told.append(line)) as reader:
+    with source(device, {"a": 1}, lambda *line: told.append(line)) as reader:
         assert values(reader) == {0: 1.0}
         device.stop()
         wait_for(lambda: told)
