@@ -10,7 +10,6 @@ import threading
 import zlib
 from collections.abc import Mapping, Sequence
 from contextlib import suppress
-from dataclasses import dataclass, field
 from decimal import Decimal, InvalidOperation
 from typing import Any
 
@@ -25,7 +24,7 @@ from sources.source import Report, Source
 from sources.tables.text import no_value
 
 from .client import mqtt_client
-from .schema import ASSET_LEVEL, BrokerSection, MqttSourceSection
+from .schema import ASSET_LEVEL, MqttSourceSection, TopicSection
 
 TOPIC_FILTER = re.compile(r"(?:(?:[^#+/\x00]*|\+)/)*(?:[^#+/\x00]*|\+|#)")
 """Topics with wildcards, as brokers take them."""
@@ -53,22 +52,11 @@ NO_EXPIRY_S = 2**32 - 1
 """Expiry of a session of MQTT 5 that is kept until the broker's own limit."""
 
 
-@dataclass(frozen=True)
-class TopicMap:
-    """Where the payloads of a topic have their values; paths are dotted, "" is the whole payload.
+class TopicMap(TopicSection):
+    """Where the payloads of a topic have their values, and which level of the topic is the name of the asset."""
 
-    `values` has the path by name; without any the payload is a message itself (see `Messages`). `unit` is that of a
-    time in numbers. Where the value at `quality` is not one of `good`, all values are missing. `asset` is the level of
-    the topic with the name of the asset, counted from 0; None if there is none.
-    """
-
-    values: Mapping[str, str] = field(default_factory=dict)
-    time: str | None = None
-    unit: str = "ns"
-    quality: str | None = None
-    good: Sequence[str] = ()
-    sequence: str | None = None
     asset: int | None = None
+    """Level of the topic with the name of the asset, counted from 0. Default: none."""
 
     def message(self, topic: str, payload: bytes) -> dict[str, Any]:
         """Return the message of a payload.
@@ -164,12 +152,10 @@ class MqttSource:
     def __init__(
         self,
         messages: Messages,
-        section: BrokerSection,
+        section: MqttSourceSection,
         topics: Mapping[str, TopicMap],
         *,
-        qos: int,
         password: str | None,
-        client_id: str | None,
         report: Report,
         subscribed: Sequence[str] | None = None,
         by_hand: bool = False,
@@ -178,22 +164,19 @@ class MqttSource:
 
         Args:
             messages: Takes the messages.
-            section: Address of the broker.
+            section: The broker. With a `client_id`, it keeps messages of QoS 1 while the twin is away.
             topics: By filter, which may have the wildcards + and #.
-            qos: Quality of service.
             password: Of the user.
-            client_id: With one, the broker keeps messages of QoS 1 while the twin is away.
             report: Receives lost connections and payloads that cannot be read.
             subscribed: Filters to subscribe to in place of those of `topics`, of which each is a part.
             by_hand: Acknowledge messages once they have been stored, see `Acknowledging`; connect after `restore`.
         """
-        self.messages, self._qos, self._report = messages, qos, report
+        self.messages, self._report = messages, report
         self.now = messages.now
         self._subscribed_to = [*topics] if subscribed is None else [*subscribed]
         self._place, self._section = f"{section.host}:{section.port}", section
-        self._client = mqtt_client(
-            section, password, client_id=client_id or "", persistent=client_id is not None, by_hand=by_hand
-        )
+        own = section.client_id
+        self._client = mqtt_client(section, password, client_id=own or "", persistent=own is not None, by_hand=by_hand)
         self._client.on_connect, self._client.on_disconnect = self._connected, self._disconnected
         self._client.on_connect_fail = lambda *_: self._lost("it does not answer")
         for name, topic in topics.items():
@@ -229,7 +212,7 @@ class MqttSource:
         self._requests.clear()
         for at in range(0, len(self._subscribed_to), MAX_TOPICS):
             names = self._subscribed_to[at : at + MAX_TOPICS]
-            self._requests[client.subscribe([(name, self._qos) for name in names])[1]] = names
+            self._requests[client.subscribe([(name, self._section.qos) for name in names])[1]] = names
 
     def _subscribed(self, _client: Any, _data: Any, number: Any, reasons: Any, _properties: Any) -> None:
         for name, reason in zip(self._requests.pop(number, self._subscribed_to), reasons, strict=False):
@@ -370,9 +353,7 @@ def open_mqtt(opening: Opening) -> Source:
         messages,
         section,
         topics,
-        qos=section.qos,
         password=password,
-        client_id=section.client_id,
         report=opening.report,
         subscribed=subscribed,
         by_hand=by_hand,

@@ -24,16 +24,12 @@ class OpcUaSource:
 
     live = utc = True
 
-    def __init__(
-        self, messages: Messages, url: str, nodes: Mapping[str, str], *, period: float, report: Report
-    ) -> None:
+    def __init__(self, messages: Messages, section: OpcUaSourceSection, report: Report) -> None:
         """Connect in a thread of its own; a server that is not there is waited for.
 
         Args:
             messages: Takes the messages.
-            url: Address of the server, opc.tcp://...
-            nodes: Node id by the name of its value.
-            period: Publishing interval, s.
+            section: The server and its nodes.
             report: Receives lost connections.
 
         Raises:
@@ -43,10 +39,10 @@ class OpcUaSource:
             from asyncua import ua
         except ModuleNotFoundError:
             raise ConfigError("OPC UA needs asyncua: pip install 'nisus[opcua]'") from None
-        self._messages, self._url, self._period = messages, url, period
+        self._messages, self._url, self._period = messages, section.url, section.every
         self.read, self.now = messages.read, messages.now
         self._names: dict[str, str] = {}
-        for name, node in nodes.items():
+        for name, node in section.nodes.items():
             try:
                 # As notifications spell it: i=85, not ns=0;i=85.
                 self._names[ua.NodeId.from_string(node).to_string()] = name
@@ -155,4 +151,4 @@ def open_opcua(opening: Opening) -> Source:
     """
     section: OpcUaSourceSection = opening.section
     messages = messages_of(opening, "nodes", section.nodes)
-    return OpcUaSource(messages, section.url, section.nodes, period=section.every, report=opening.report)
+    return OpcUaSource(messages, section, opening.report)

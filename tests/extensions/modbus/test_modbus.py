@@ -26,12 +26,8 @@ def device():
 
 def source(served, registers, report=lambda key, text: None, **given):
     channels = [Channel(READING, k, name, (name,), model_units=("1",)) for k, name in enumerate(registers)]
-    section = section_of(registers, port=served.port, every=0.01, **given)
-    return closing(ModbusSource(Messages(channels, width=1), section, report))
-
-
-def section_of(registers, **given):
-    return ModbusSourceSection(type="modbus", host="127.0.0.1", registers=registers, **given)
+    given |= {"type": "modbus", "host": "127.0.0.1", "port": served.port, "every": 0.01, "registers": registers}
+    return closing(ModbusSource(Messages(channels, width=1), ModbusSourceSection(**given), report))
 
 
 def values(reader, want=1):
@@ -70,12 +66,12 @@ def test_bits_are_zero_and_one(device):
 
 def test_adjacent_registers_are_one_request_of_at_most_125():
     registers = {f"r{k}": k for k in range(200)} | {"apart": {"address": 300, "type": "float64"}}
-    spans = [(block.table, block.first, block.end) for block in blocks_of(section_of(registers).registers)]
-    assert spans == [("holding", 0, 125), ("holding", 125, 200), ("holding", 300, 304)]
     # Two views of the same registers overlap; other tables are other requests.
-    registers = {"whole": {"address": 0, "type": "float64"}, "part": 1, "bit": {"address": 1, "table": "coil"}}
-    coil, holding = blocks_of(section_of(registers).registers)
-    assert coil == ("coil", 1, 2, ("bit",)) and holding == ("holding", 0, 4, ("whole", "part"))
+    registers |= {"whole": {"address": 400, "type": "float64"}, "part": 401, "bit": {"address": 401, "table": "coil"}}
+    bits, *found = blocks_of(ModbusSourceSection(type="modbus", host="device", registers=registers).registers)
+    assert bits == ("coil", 401, 402, ("bit",)) and {block.table for block in found} == {"holding"}
+    assert [(block.first, block.end) for block in found] == [(0, 125), (125, 200), (300, 304), (400, 404)]
+    assert found[-1].names == ("whole", "part")
 
 
 def test_what_the_device_refuses_is_missing_and_told(device):

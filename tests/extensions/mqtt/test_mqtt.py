@@ -129,9 +129,9 @@ def test_no_retained_payload_without_a_time_is_used_and_a_topic_that_is_refused_
     reported = []
     source = MqttSource(
         Messages([Channel(0, 0, "winding", ("winding",), model_units=("°C",))], width=1),
-        SimpleNamespace(host="127.0.0.1", port=free_port(), user=None, ca_file=None),
+        SimpleNamespace(host="127.0.0.1", port=free_port(), user=None, ca_file=None, client_id=None),
         topics := {"plant/+": TopicMap(), "plant/t": TopicMap(values={"winding": "v"}, time="t")},
-        qos=1, password=None, client_id=None, report=lambda key, text: reported.append(text),
+        password=None, report=lambda key, text: reported.append(text),
     )  # fmt: skip
     try:
         sent = {"plant/+": {"values": {"winding": 40.0}}, "plant/t": {"v": 40.0, "t": None}}
