@@ -206,10 +206,11 @@ class Channel:
     repeats: float | None = None
 
     def __post_init__(self) -> None:
-        """Spread the defaults over the rows."""
+        """Spread the defaults, and what one entry gives for all, over the rows."""
         count = len(self.signals)
         for field, default in (("units", None), ("model_units", ""), ("scale", 1.0), ("offset", 0.0)):
-            value = tuple(getattr(self, field)) or (default,) * count
+            value = tuple(getattr(self, field)) or (default,)
+            value = value * count if len(value) == 1 else value
             if len(value) != count:
                 raise ValueError(f"channel {self.name}: {field} has {len(value)} entries for {count} signals")
             object.__setattr__(self, field, value)

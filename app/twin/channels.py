@@ -89,10 +89,10 @@ def channel_of(
         name=name,
         signals=names,
         message=item.message if isinstance(item, SignalSection) else None,
-        units=_spread(item.units or (None,), len(rows)),
+        units=item.units or (),
         model_units=tuple(unit for _, unit in rows),
-        scale=_spread(item.scale, len(rows)),
-        offset=_spread(item.offset, len(rows)),
+        scale=item.scale,
+        offset=item.offset,
         where=_conditions(item.where),
         only=_conditions(item.only),
         convert=item.convert,
@@ -114,11 +114,6 @@ def _conditions(given: Mapping[str, ConditionSection]) -> tuple[Condition, ...]:
         else:
             found.append(Condition(TextMatch(signal, rule.text), 1.0, 1.0))
     return tuple(found)
-
-
-def _spread(values: tuple, count: int) -> tuple:
-    """Return a value for each row, from one for all or one each (the schema has checked the number)."""
-    return values * count if len(values) == 1 else values
 
 
 def read_faults(loaded: Loaded, sections: Sequence[FaultSection], key: Key, model: StateSpaceModel) -> list[Fault]:
