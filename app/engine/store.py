@@ -1,8 +1,8 @@
 """Store of a running twin: an SQLite file from which it continues after a restart, a kill or a power failure.
 
-The file has one table of parts: rows of events, the base of their fold, settings, runs, notes, and the state of the
-checks on entry. Each transaction replaces the parts that have changed since the last one, so the file always has a
-complete state of the twin; it is as long as the twin's history. A process keeps it locked while it runs.
+The file has one table of parts: rows of events, the base of their fold, settings, runs, notes, the state of the checks
+on entry, and open alerts. Each transaction replaces the parts that have changed since the last one, so the file always
+has a complete state of the twin; it is as long as the twin's history. A process keeps it locked while it runs.
 """
 
 from __future__ import annotations
@@ -66,7 +66,7 @@ SHORT_ROW_EVENTS, MAX_SHORT_ROWS, MAX_SHORT_EVENTS = 1024, 256, 4096
 MAX_WAL_BYTES = 4 * 2**20
 """Size to which the write-ahead log is cut after a long transaction."""
 
-EVENTS, COMMANDS = "events", "command"
+EVENTS, COMMANDS, ALERTS = "events", "command", "alerts"
 
 MAX_STORED_COMMANDS = 100_000
 """Commands of users that are kept; about 20 MB."""
@@ -75,7 +75,7 @@ DAMAGED = "is damaged; remove it, or choose another path"
 
 
 class Store:
-    """The file: it is locked, read once, and then written."""
+    """The file: it is locked, read once, and then written, from any thread."""
 
     def __init__(self, path: Path) -> None:
         """Open the file, or create it.
@@ -84,11 +84,12 @@ class Store:
             SourceError: If it cannot be opened or written, is locked, or is no store of this version.
         """
         self.path = path
+        self._lock = threading.RLock()
+        self._rows: list[tuple[int, int]] = []
+        """First index and number of the events of each row."""
         self._connect()
 
     def _connect(self) -> None:
-        self._rows: list[tuple[int, int]] = []
-        """First index and number of the events of each row."""
         with self._failing():
             self.path.parent.mkdir(parents=True, exist_ok=True)
             self._file = sqlite3.connect(self.path, timeout=0.0, isolation_level=None, check_same_thread=False)
@@ -101,13 +102,16 @@ class Store:
         self._identity = _identity(self.path)
 
     def _check_file(self) -> None:
-        """Raise if the file has been removed, and begin another one, or if it has been replaced."""
+        """Raise if the file has been removed, and begin another one with its content, or if it has been replaced."""
         if (now := _identity(self.path)) == self._identity:
             return
         if now is not None:
             raise self._error("another file was put in its place; stop the twin to continue from that, or remove it")
-        self.close()
-        self._connect()
+        with self._failing():
+            removed = self._file
+            self._connect()
+            removed.backup(self._file)
+            removed.close()
         raise self._error("the file was removed, a new one is begun")
 
     def _open(self) -> None:
@@ -142,13 +146,8 @@ class Store:
         rows: list[tuple[int, Events]] = []
         commands: list[dict[str, Any]] = []
         with self._failing():
-            last = "SELECT max(at) FROM parts WHERE kind = ?"
-            for kind, at, count, crc, data in self._file.execute(
-                f"SELECT * FROM parts WHERE kind != ? OR at > ({last}) - ? ORDER BY kind, at",
-                (COMMANDS, COMMANDS, MAX_COMMANDS),
-            ):
-                if zlib.crc32(data) != crc:
-                    raise self._error(DAMAGED)
+            own = "kind != ? AND (kind != ? OR at > (SELECT max(at) FROM parts WHERE kind = ?) - ?)"
+            for kind, at, count, data in self._read(own, ALERTS, COMMANDS, COMMANDS, MAX_COMMANDS):
                 if kind == EVENTS:
                     rows.append((at, _events_from_bytes(data, count)))
                 elif kind == COMMANDS:
@@ -197,19 +196,15 @@ class Store:
                 self._file.execute("DELETE FROM parts WHERE kind = ? AND at <= ?", (COMMANDS, oldest))
         self._rows = rows
 
-    def read_blocks(self) -> dict[tuple[str, int], bytes]:
-        """Return the blocks of `write_blocks` by kind and number.
+    def read_blocks(self, *kinds: str) -> dict[tuple[str, int], bytes]:
+        """Return the blocks of `write_blocks` of some kinds by kind and number.
 
         Raises:
             SourceError: If the file is damaged.
         """
-        found = {}
         with self._failing():
-            for kind, at, _, crc, data in self._file.execute("SELECT * FROM parts"):
-                if zlib.crc32(data) != crc:
-                    raise self._error(DAMAGED)
-                found[kind, at] = data
-        return found
+            found = self._read(f"kind IN ({', '.join('?' * len(kinds))})", *kinds)
+            return {(kind, at): data for kind, at, _, data in found}
 
     def write_blocks(self, blocks: Mapping[tuple[str, int], bytes]) -> None:
         """Replace blocks of bytes, each with a kind and a number, in one transaction; raises as `write`."""
@@ -238,13 +233,19 @@ class Store:
         self._put(EVENTS, at, len(events), _events_to_bytes(events))
         rows.append((at, len(events)))
 
+    def _read(self, condition: str, *given: Any) -> Iterator[tuple[str, int, int, bytes]]:
+        """Yield kind, number, count of events, and data of parts in their order."""
+        sql = f"SELECT * FROM parts WHERE {condition} ORDER BY kind, at"
+        for kind, at, count, crc, data in self._file.execute(sql, given):
+            if zlib.crc32(data) != crc:
+                raise self._error(DAMAGED)
+            yield kind, at, count, data
+
     def _put(self, kind: str, at: int, count: int, data: bytes) -> None:
         self._file.execute("REPLACE INTO parts VALUES (?, ?, ?, ?, ?)", (kind, at, count, zlib.crc32(data), data))
 
     def _events(self, at: int) -> Events:
-        count, data = self._file.execute(
-            "SELECT count, data FROM parts WHERE kind = ? AND at = ?", (EVENTS, at)
-        ).fetchone()
+        ((_, _, count, data),) = self._read("kind = ? AND at = ?", EVENTS, at)
         return _events_from_bytes(data, count)
 
     def _remove(self, at: int) -> None:
@@ -263,9 +264,10 @@ class Store:
 
     @contextmanager
     def _failing(self) -> Iterator[None]:
-        """Raise what SQLite or the operating system raises as `SourceError`, with the remedy."""
+        """Lock; raise what SQLite or the operating system raises as `SourceError`, with the remedy."""
         try:
-            yield
+            with self._lock:
+                yield
         except sqlite3.Error as error:
             code = getattr(error, "sqlite_errorcode", None)
             reason = REASONS.get(-1 if code is None else code & 0xFF, f"cannot be used ({error}); choose another path")

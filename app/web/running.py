@@ -141,7 +141,7 @@ class RunningTwin:
                 self.engine.notices.say("a recording is replayed: no alerts are sent")
         else:
             page = None if door is None else door.site
-            self.publisher = self.engine.published = Publisher(self.engine, page=page, store=opening.store)
+            self.publisher = self.engine.published = Publisher(self.engine, page=page, store=store)
         self.view: Any = None
         self.server: Any = None
         self.gone: threading.Event | None = None

@@ -1,4 +1,4 @@
-"""Open alerts, and those that wait for receivers, in a file beside the store of a twin or fleet.
+"""Open alerts, and those that wait for receivers, in the store of a twin or fleet.
 
 An alert is written before it is sent, so after a restart it has the same id: it is neither begun again nor forgotten.
 """
@@ -8,21 +8,14 @@ from __future__ import annotations
 import json
 import time
 from collections.abc import Iterable, Sequence
-from pathlib import Path
 from typing import Any, Protocol
 
 from estimators.errors import NisusError, SourceError
 
 from ..notices import Notices
-from ..store import RETRY_PERIOD_S, Store
+from ..store import ALERTS, RETRY_PERIOD_S, Store
 from .alerts import AlertMessage
 from .receivers import Deliveries
-
-SUFFIX = ".alerts"
-"""Follows the name of the store."""
-
-BLOCK = "alerts", 0
-"""Kind and number of the only block of the file."""
 
 
 class StoredRules(Protocol):
@@ -40,49 +33,41 @@ class StoredRules(Protocol):
 
 
 class AlertStore:
-    """The file; without a path nothing is kept. Not for several threads at once."""
+    """Part of a store; without one nothing is kept. Not for several threads at once."""
 
-    def __init__(self, store: Path | None, owner: str, notices: Notices) -> None:
-        """`store`: of the twin or fleet whose name is `owner`; nothing is opened yet."""
-        self._path = None if store is None else store.with_name(store.name + SUFFIX)
-        self._owner, self._notices = owner, notices
+    def __init__(self, store: Store | None, notices: Notices) -> None:
+        """`store`: of the twin or fleet."""
+        self._unread, self._notices = store, notices
         self._store: Store | None = None
         self._written: object = None
         """Counts of the receivers at the last write; None if it failed, or nothing was written."""
-        self._retry: float | None = None
+        self._retry = 0.0
+        """When to try again after a failure, monotonic, s; 0 without one."""
 
     def open(self, rules: StoredRules, deliveries: Deliveries) -> str:
-        """Open the file and continue with its alerts; return why it cannot be used, or empty."""
-        if self._path is None or self._store is not None:
+        """Continue with the alerts of the store; return why it cannot be used, or empty."""
+        store, self._unread = self._unread, None
+        if store is None:
             return ""
-        store = None
         try:
-            store = Store(self._path)
-            data = store.read_blocks().get(BLOCK)
-            if data is not None:
-                self._continue(json.loads(data), rules, deliveries)
+            _adopt(store)
+            for data in store.read_blocks(ALERTS).values():
+                kept = json.loads(data)
+                # First what may fail halfway.
+                waiting = [(name, rules.message(**item)) for name, item in kept["waiting"]]
+                rules.restore(kept["open"], max(0.0, time.time() - kept["written"]))
+                deliveries.restore(waiting)
         except Exception as error:  # noqa: BLE001  a file may hold anything; alerts are sent without it
-            if store is not None:
-                store.close()
-            known = isinstance(error, NisusError)
-            reason = str(error) if known else f"cannot be continued ({type(error).__name__}); remove it"
-            text = f"{reason if known else f'store {self._path}: {reason}'}; alerts are not kept over a restart"
+            text = f"store {store.path}: cannot be continued ({type(error).__name__}); remove it"
+            text = str(error) if isinstance(error, NisusError) else text
+            text += "; alerts are not kept over a restart"
             self._notices.say(text, level="warn")
-            self._path = None  # it stays as it is
-            return text
+            return text  # they stay as they are
         self._store = store
         return ""
 
-    def _continue(self, kept: dict[str, Any], rules: StoredRules, deliveries: Deliveries) -> None:
-        if kept["of"] != self._owner:
-            raise SourceError(f"store {self._path}: is of {kept['of']}; remove it, or choose another path")
-        # First what may fail halfway.
-        waiting = [(name, rules.message(**item)) for name, item in kept["waiting"]]
-        rules.restore(kept["open"], max(0.0, time.time() - kept["written"]))
-        deliveries.restore(waiting)
-
     def send(self, rules: StoredRules, deliveries: Deliveries, due: Iterable[tuple[Any, AlertMessage]]) -> None:
-        """Put alerts, each with its rule, into the queues of their receivers, once they are in the file."""
+        """Put alerts, each with its rule, into the queues of their receivers, once they are in the store."""
         meant = [(alert, deliveries.names(rule.to)) for rule, alert in due]
         counts = deliveries.counts()
         if meant or counts != self._written:
@@ -93,30 +78,38 @@ class AlertStore:
     def _write(
         self, rules: StoredRules, deliveries: Deliveries, due: Sequence[tuple[AlertMessage, Sequence[str]]], counts: Any
     ) -> None:
-        if self._store is None or (self._retry is not None and time.monotonic() < self._retry):
+        if self._store is None or time.monotonic() < self._retry:
             return
         waiting = [*deliveries.waiting(), *((name, alert) for alert, names in due for name in names)]
         kept = {
-            "of": self._owner,
             "written": time.time(),
             "open": rules.state(),
             "waiting": [(name, alert.model_dump(mode="json")) for name, alert in waiting],
         }
         try:
-            self._store.write_blocks({BLOCK: json.dumps(kept).encode()})
+            self._store.write_blocks({(ALERTS, 0): json.dumps(kept).encode()})
         except SourceError as error:
-            if self._retry is None:
+            if not self._retry:
                 self._notices.say(f"{error}; alerts are sent without it, and it is tried again", level="error")
             self._written, self._retry = None, time.monotonic() + RETRY_PERIOD_S
             return
-        if self._retry is not None:
-            self._notices.say(f"store {self._path}: it is written again")
-        self._written, self._retry = counts, None
+        if self._retry:
+            self._notices.say(f"store {self._store.path}: it is written again")
+        self._written, self._retry = counts, 0.0
 
     def close(self, rules: StoredRules, deliveries: Deliveries) -> None:
-        """Write the rest, and close the file."""
+        """Write the rest; the store stays open."""
         if self._store is not None:
-            self._retry = None
+            self._retry = 0.0
             self.send(rules, deliveries, ())
-            self._store.close()
             self._store = None
+
+
+def _adopt(store: Store) -> None:
+    """Move the alerts of an earlier version from their own file, beside that of the store, into the store."""
+    path = store.path.with_name(f"{store.path.name}.alerts")
+    if path.is_file():
+        before = Store(path)
+        store.write_blocks(before.read_blocks(ALERTS))
+        before.close()
+        path.unlink()

@@ -9,7 +9,6 @@ import threading
 import time
 from collections.abc import Callable
 from functools import partial
-from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple, Protocol, runtime_checkable
 
 import numpy as np
@@ -30,6 +29,7 @@ if TYPE_CHECKING:
     from config.schema import TwinSection
 
     from ..engine import Engine
+    from ..store import Store
 
 ALIVE_PERIOD_S = 1.0
 """Between two messages of a state that does not change: its age does."""
@@ -76,20 +76,20 @@ class Parts(NamedTuple):
 class Publisher:
     """Outputs and alerts of one running twin, as its YAML asks for them."""
 
-    def __init__(self, engine: Engine, *, page: str | None = None, store: Path | None = None) -> None:
+    def __init__(self, engine: Engine, *, page: str | None = None, store: Store | None = None) -> None:
         """Prepare; nothing is connected yet.
 
         Args:
             engine: The running twin.
             page: Address of its page, without the token; None without one.
-            store: File of its state, beside which the open alerts are kept; None for none.
+            store: Its store, in which the open alerts are kept; None for none.
 
         Raises:
             NisusError: If a package or a secret is missing.
         """
         self._engine, self._page = engine, page
         self._parts = self._make()
-        self._store = AlertStore(store, engine.twin.name, engine.notices)
+        self._store = AlertStore(store, engine.notices)
         self.problem = ""
         """Why alerts are not kept, once it has started; empty if they are, or without a store."""
         self._grown = threading.Event()

@@ -84,17 +84,14 @@ def run_fleet(arguments: FleetCommand) -> int:
 
         running.archive = FleetArchive(archive, plan.twin.model, running.names, say, running.archived)
     page = None if door is None else door.site
-    publisher = None if plan.ends else FleetPublisher(running, page=page, store=store)
-    if publisher is not None:
+    if not plan.ends:
+        publisher = FleetPublisher(running, page=page)
+        running.end_publishing = publisher.stop
         publisher.start()
-    try:
-        if door is not None:
-            _serve(running, door, arguments, overrides, archive)
-        else:
-            _fold(running, arguments.duration)
-    finally:
-        if publisher is not None:
-            publisher.stop()
+    if door is not None:
+        _serve(running, door, arguments, overrides, archive)
+    else:
+        _fold(running, arguments.duration)
     _, _, table = running.table()
     if not len(table.assets) or not table.events.any():
         place = plan.source.loaded.places.at(("source",))
@@ -132,9 +129,9 @@ def _serve(
     opened = partial(_opened, arguments.fleet, overrides, arguments.recordings, archived)
     overview = FleetApi(running)
     supervisor = Supervisor({}, partial(run_child, opened, False), preload=FLEET_PRELOADED, on_demand=True)
-    service = Service(supervisor, door=door, overview=overview)
-    running.start()
     try:
+        service = Service(supervisor, door=door, overview=overview)
+        running.start()
         serve_until_end(service, f"the fleet {running.plan.name}", arguments.duration)
     finally:
         running.stop()

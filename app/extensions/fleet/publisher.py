@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import time
 from collections.abc import Sequence
-from pathlib import Path
 from typing import TYPE_CHECKING
 
 from app.engine.jobs import Jobs, LoopThread
@@ -35,13 +34,12 @@ POLL_S = 0.002
 class FleetPublisher:
     """Outputs and alerts of a running fleet, as its YAML asks for them."""
 
-    def __init__(self, fleet: RunningFleet, *, page: str | None = None, store: Path | None = None) -> None:
+    def __init__(self, fleet: RunningFleet, *, page: str | None = None) -> None:
         """Prepare; nothing is connected yet.
 
         Args:
             fleet: The running fleet.
             page: Address of its overview, without the token; None without one.
-            store: File of its state, beside which the open alerts are kept; None for none.
 
         Raises:
             NisusError: If a package or a secret is missing.
@@ -62,7 +60,7 @@ class FleetPublisher:
             self._mqtt = MqttOutput(section.mqtt, plan.name, model, notices, secrets, of_assets=True)
         self._deliveries = Deliveries(section.receivers, folder, {"mqtt": self._mqtt}, self.notices, secrets)
         self._rules = FleetRules(rules or (HEALTH_RULE,), plan.name, link=page)
-        self._store = AlertStore(store, plan.name, self.notices)
+        self._store = AlertStore(fleet.file, self.notices)
         self._jobs = Jobs(self.notices, "output", threads=max(1, len(self._deliveries.queues)), niceness=0)
         self._thread = LoopThread(self._run, "outputs")
 

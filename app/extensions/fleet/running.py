@@ -160,7 +160,9 @@ class RunningFleet:
         """Whether the store could not be written at the last attempt."""
         self.archived: Mapping[str, Any] | None = None
         """Numbers of the archive that the store has; None without a store, or without an archive in it."""
-        self._store = None if store is None else Store(store)
+        self.end_publishing: Callable[[], None] = lambda: None
+        """Called with the last state, before the store is closed, which has the alerts."""
+        self.file = None if store is None else Store(store)
         try:
             self.source = plan.open(self.note, stored=store is not None)
             messages = getattr(self.source, "messages", self.source)
@@ -168,11 +170,11 @@ class RunningFleet:
                 messages.room = self._room
             horizon = round(plan.twin.config.time.horizon * 1e9)
             self._guard = ClockGuard(self._last.size, horizon, True) if is_utc(self.source) else None
-            if self._store is not None:
-                self._continue(self._store)
+            if self.file is not None:
+                self._continue(self.file)
         except BaseException:
-            if self._store is not None:
-                self._store.close()
+            if self.file is not None:
+                self.file.close()
             if hasattr(self, "source"):
                 self.source.close()
             raise
@@ -180,7 +182,7 @@ class RunningFleet:
     @property
     def store(self) -> RunningFleet | None:
         """What keeps its state, see `Keeper`; None without a store."""
-        return None if self._store is None else self
+        return None if self.file is None else self
 
     def ask(self) -> None:
         """See `Keeper`."""
@@ -219,8 +221,9 @@ class RunningFleet:
         """Stop, and close the source."""
         self._thread.stop(30.0)
         self.source.close()
-        if self._store is not None:
-            self._store.close()
+        self.end_publishing()
+        if self.file is not None:
+            self.file.close()
         if self.archive is not None:
             self.archive.stop()
 
@@ -390,9 +393,9 @@ class RunningFleet:
     def _keep(self, at_once: bool = False) -> None:
         """Write what has changed to the store, with the position in the source; all events are folded."""
         begun, source = time.monotonic(), self.source
-        if self._store is None or self._unwritten:  # rather than wait in memory for as long as that lasts
+        if self.file is None or self._unwritten:  # rather than wait in memory for as long as that lasts
             self._hand_over()
-        if self._store is None:
+        if self.file is None:
             return
         urgent = at_once or self._asked
         if isinstance(source, Acknowledging):
@@ -414,7 +417,7 @@ class RunningFleet:
         try:
             # Before: a kill loses no row that the store has. Messages that it has not come again.
             with nullcontext(self.archived) if self.archive is None else self.archive.written(rows) as state["archive"]:
-                self._store.write_blocks(blocks | {("state", 0): json.dumps(state).encode()})
+                self.file.write_blocks(blocks | {("state", 0): json.dumps(state).encode()})
         except SourceError as error:
             if at_once:
                 raise
@@ -424,7 +427,7 @@ class RunningFleet:
             return
         if self._unwritten:
             self._unwritten = False
-            self._report(STORE, f"store {self._store.path}: it is written again")
+            self._report(STORE, f"store {self.file.path}: it is written again")
         self._changed.clear()
         self._kept = mark
         if isinstance(source, Acknowledging):
@@ -439,7 +442,7 @@ class RunningFleet:
             self._unarchived.clear()
 
     def _continue(self, store: Store) -> None:
-        blocks = store.read_blocks()
+        blocks = store.read_blocks("state", "assets", "last")
         state: dict[str, Any] = json.loads(blocks.get(("state", 0), b"{}"))
         if state:
             for key, value in self._identity().items():

@@ -269,11 +269,14 @@ def test_an_unexpected_failure_is_one_line_and_everything_is_written_later(path,
 
 def test_a_file_that_is_removed_is_begun_again(path):
     session = Session(path).put(walk(100)).write()
+    session.running.store._store.write_blocks({("alerts", 0): b"of another thread"})
     path.unlink()
     session.put(walk(200, 100)).write()
     assert "the file was removed, a new one is begun" in session.notices()[-1]
     session.put(walk(300, 200)).write().kill()
-    assert pull_all(Session(path).engine).events.t.size == 300
+    after = Session(path)
+    assert pull_all(after.engine).events.t.size == 300
+    assert [*after.running.store._store.read_blocks("alerts").values()] == [b"of another thread"]
 
 
 def test_a_file_that_is_replaced_is_left_alone(tmp_path):

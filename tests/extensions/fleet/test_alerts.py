@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 
 from app.engine.outputs.alerts import SETTLE_S, AlertRules
+from app.engine.store import Store
 from app.extensions.fleet.alerts import MAX_ABSENCE_S, MAX_LISTED, FleetRules
 from app.extensions.fleet.publisher import FleetPublisher
 from app.extensions.fleet.schema import FleetAlertSection
@@ -252,13 +253,14 @@ def test_a_fleet_resolves_after_a_restart_with_its_assets_in_another_order(tmp_p
 
     def run(names, health, count):
         now = table(health)._replace(assets=names)
-        fleet = SimpleNamespace(plan=plan, failure="", table=lambda: (1, names, now))
-        publisher = FleetPublisher(fleet, store=tmp_path / "pumps.store")
+        store = Store(tmp_path / "pumps.store")
+        publisher = FleetPublisher(SimpleNamespace(plan=plan, failure="", table=lambda: (1, names, now), file=store))
         publisher.start()
         try:
             wait_for(lambda: len(hook.alerts) == count)
         finally:
             publisher.stop()
+            store.close()
 
     run(["a", "b", "c"], ["degraded", "tracking", "stale"], 1)
     run(["c", "a", "b", "d"], ["tracking", "tracking", "tracking", "degraded"], 2)

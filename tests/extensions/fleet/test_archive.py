@@ -96,7 +96,7 @@ def test_rows_of_a_store_are_archived_once_whenever_it_is_killed(killed, tmp_pat
     def kill(fleet):
         if fleet.archive._journal is not None:
             fleet.archive._journal._file.close()  # as the end of the process does
-        fleet._store.close()
+        fleet.file.close()
 
     def steps(fleet, source, parts):
         for part in parts:
@@ -117,7 +117,7 @@ def test_rows_of_a_store_are_archived_once_whenever_it_is_killed(killed, tmp_pat
         other.archive.look()
         other.archive._journal._file.close()
     if killed == "before the transaction":
-        monkeypatch.setattr(fleet._store, "write_blocks", lambda blocks: 1 / 0)
+        monkeypatch.setattr(fleet.file, "write_blocks", lambda blocks: 1 / 0)
         with pytest.raises(ZeroDivisionError):
             steps(fleet, source, parts[3:4])
         kill(fleet)
@@ -286,12 +286,12 @@ def test_a_journal_in_a_folder_that_was_emptied_is_cut_as_in_the_old_one(tmp_pat
         fleet.archive.look(closing=True)
     for path in folder.iterdir():
         path.unlink()
-    monkeypatch.setattr(fleet._store, "write_blocks", lambda blocks: 1 / 0)
+    monkeypatch.setattr(fleet.file, "write_blocks", lambda blocks: 1 / 0)
     source.send(sent[28:])
     with pytest.raises(ZeroDivisionError):
         fleet.step()
     fleet.archive._journal._file.close()  # as the end of the process does
-    fleet._store.close()
+    fleet.file.close()
     again, source = started(tmp_path, store=store)
     source.send(sent[28:])
     again.step()

@@ -10,6 +10,7 @@ import pyarrow.parquet
 import pytest
 
 from app.cli.main import main
+from app.engine.store import Store
 from app.extensions.fleet.plan import load_fleet
 from app.extensions.fleet.running import RunningFleet
 from app.twin.twin import load_twin
@@ -148,11 +149,11 @@ def test_a_live_source_without_measurements_is_told_from_wrong_channels(tmp_path
     assert capsys.readouterr().err == "nisus: pumps.yaml:2: no measurement arrived; check that its senders run\n"
 
 
-def test_open_alerts_of_a_fleet_are_kept_beside_its_store(tmp_path, capsys):
+def test_open_alerts_of_a_fleet_are_kept_in_its_store(tmp_path, capsys):
     receivers = "outputs: {receivers: {ops: {type: webhook, url: 'http://127.0.0.1:9'}}}"
     (tmp_path / "pumps.yaml").write_text(f"twin: motor_winding\nsource: {{type: push}}\n{receivers}\n")
     assert main(["fleet", "pumps.yaml", "--headless", "--duration", "0.1", "--store", "."]) == 2
-    assert (tmp_path / "pumps.store.alerts").exists()
+    assert Store(tmp_path / "pumps.store").read_blocks("alerts")
     capsys.readouterr()
 
 

@@ -351,7 +351,7 @@ def test_a_store_on_a_full_disk_is_tried_again_while_the_fleet_goes_on(tmp_path,
 def test_a_fleet_that_stands_still_refuses_messages_and_is_not_ready(tmp_path, monkeypatch):
     """Also those that it had accepted, but neither folded nor stored."""
     fleet, said = running(tmp_path)
-    fleet._store = SimpleNamespace(path="fleet.store", write_blocks=lambda blocks: None, close=lambda: None)
+    fleet.file = SimpleNamespace(path="fleet.store", write_blocks=lambda blocks: None, close=lambda: None)
     api = FleetApi(fleet)
     assert api.unready() == "no measurement has arrived"
 

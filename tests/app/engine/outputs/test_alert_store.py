@@ -11,12 +11,13 @@ from app.engine.outputs import alert_store
 from app.engine.outputs.alert_store import AlertStore
 from app.engine.outputs.alerts import SETTLE_S
 from app.engine.outputs.receivers import Deliveries
+from app.engine.store import Store
 from app.twin.secrets import NO_SECRETS
 from config.output_schema import WebhookSection
 from estimators.errors import SourceError
 from tests.app.engine.outputs.pushed import publishing, push
 from tests.app.engine.outputs.test_alerts import Looked, Receiver, episode, started, state
-from tests.app.engine.test_store import ANOTHER, rewritten
+from tests.app.engine.test_store import rewritten
 from tests.support import run_python
 from tests.waiting import LIMIT_S, wait_for
 
@@ -85,16 +86,17 @@ def test_the_alerts_of_episodes_and_of_rules_that_were_removed_are_resolved():
 
 
 class Process:
-    """Rules, receivers and file of one process; its threads are those of the test."""
+    """Rules, receivers and store of one process; its threads are those of the test."""
 
-    def __init__(self, folder, monkeypatch, owner="motor", make=Looked, dead=False, **rule):
+    def __init__(self, folder, monkeypatch, make=Looked, dead=False, **rule):
         self.receiver = Receiver(dead)
         monkeypatch.setattr("app.engine.outputs.receivers.make_receivers", lambda *_: {"ops": self.receiver})
         self.notices = Notices(lambda: 0)
         section = WebhookSection(type="webhook", url="http://127.0.0.1:9/")
         self.deliveries = Deliveries({"ops": section}, folder, None, self.notices, NO_SECRETS)
         self.looked = make(**rule)
-        self.store = AlertStore(folder / "motor.store", owner, self.notices)
+        self.file = Store(folder / "motor.store")
+        self.store = AlertStore(self.file, self.notices)
         self.problem = self.store.open(self.looked.rules, self.deliveries)
 
     def look(self, t, **fields):
@@ -109,7 +111,7 @@ class Process:
 
     def kill(self):
         """End as a killed process does: nothing more is written."""
-        self.store._store.close()
+        self.file.close()
 
     def said(self):
         return [line.text for line in self.notices.since(0)]
@@ -127,8 +129,9 @@ def test_an_alert_is_stored_before_it_is_sent_and_told_once(tmp_path, monkeypatc
     ((status, number),) = second.deliver()
     assert status == "firing"
     second.kill()
+    (tmp_path / "motor.store").rename(tmp_path / "motor.store.alerts")  # where earlier versions kept them
     third = Process(tmp_path, monkeypatch, **RULE)
-    assert third.deliver() == [("firing", number)]
+    assert third.deliver() == [("firing", number)] and not [*tmp_path.glob("*.alerts")]
     third.look(0.2, **BAD)
     third.kill()
     # From then on it was told; the cause has gone meanwhile.
@@ -137,6 +140,7 @@ def test_an_alert_is_stored_before_it_is_sent_and_told_once(tmp_path, monkeypatc
     fourth.look(SETTLE_S)
     assert fourth.deliver() == [("resolved", number)]
     fourth.store.close(fourth.looked.rules, fourth.deliveries)
+    fourth.kill()
     fifth = Process(tmp_path, monkeypatch, **RULE).look(0.0).look(100.0)
     assert fifth.deliver() == [] and fifth.said() == []
 
@@ -144,8 +148,6 @@ def test_an_alert_is_stored_before_it_is_sent_and_told_once(tmp_path, monkeypatc
 @pytest.mark.parametrize(
     ("spoil", "reason"),
     [
-        (lambda path: path.write_text("a: text\n" * 1000), "is no store of Nisus; choose another path"),
-        ANOTHER,
         (rewritten("UPDATE parts SET crc = 1"), "is damaged; remove it, or choose another path"),
         (
             rewritten(f"UPDATE parts SET data = x'7b7d', crc = {zlib.crc32(b'{}')}"),
@@ -153,8 +155,8 @@ def test_an_alert_is_stored_before_it_is_sent_and_told_once(tmp_path, monkeypatc
         ),
     ],
 )
-def test_a_file_that_cannot_be_used_is_one_line_and_alerts_are_sent(tmp_path, monkeypatch, spoil, reason):
-    path = tmp_path / "motor.store.alerts"
+def test_a_part_that_cannot_be_used_is_one_line_and_alerts_are_sent(tmp_path, monkeypatch, spoil, reason):
+    path = tmp_path / "motor.store"
     Process(tmp_path, monkeypatch, **RULE).look(0.0, **BAD).kill()
     spoil(path)
     before = path.read_bytes()[100:]
@@ -164,30 +166,21 @@ def test_a_file_that_cannot_be_used_is_one_line_and_alerts_are_sent(tmp_path, mo
     assert line.endswith("; alerts are not kept over a restart")
     assert [status for status, _ in process.look(0.0, **BAD).deliver()] == ["firing"]
     process.store.close(process.looked.rules, process.deliveries)
+    process.kill()
     assert path.read_bytes()[100:] == before
-
-
-def test_a_file_of_another_twin_or_in_use_is_left_alone(tmp_path, monkeypatch):
-    first = Process(tmp_path, monkeypatch, **RULE).look(0.0, **BAD)
-    assert "another process uses it" in Process(tmp_path, monkeypatch, **RULE).problem
-    first.kill()
-    assert "motor.store.alerts: is of motor; remove it" in Process(tmp_path, monkeypatch, "pump", **RULE).problem
-    assert not list(tmp_path.glob("other*"))
-    none = AlertStore(None, "motor", first.notices)
-    assert none.open(first.looked.rules, first.deliveries) == ""
 
 
 def test_alerts_are_sent_while_the_disk_is_full(tmp_path, monkeypatch):
     monkeypatch.setattr(alert_store, "RETRY_PERIOD_S", 0.0)
     process = Process(tmp_path, monkeypatch, **RULE)
-    write, full = process.store._store.write_blocks, [True]
+    write, full = process.file.write_blocks, [True]
 
     def write_or_fail(blocks):
         if full[0]:
             raise SourceError("the disk is full")
         write(blocks)
 
-    process.store._store.write_blocks = write_or_fail
+    process.file.write_blocks = write_or_fail
     full[0] = False
     process.look(0.0)
     full[0] = True
@@ -199,7 +192,7 @@ def test_alerts_are_sent_while_the_disk_is_full(tmp_path, monkeypatch):
     lines = [line for line in process.said() if line.startswith(("the disk", "store"))]
     assert lines == [
         "the disk is full; alerts are sent without it, and it is tried again",
-        f"store {tmp_path / 'motor.store.alerts'}: it is written again",
+        f"store {tmp_path / 'motor.store'}: it is written again",
     ]
     after = Process(tmp_path, monkeypatch, **RULE).look(SETTLE_S)
     assert after.deliver() == [("firing", number), ("resolved", number)]  # neither was known to be delivered
