@@ -229,37 +229,18 @@ def _indexed(file: Any) -> tuple[dict[str, Declared], Messages] | None:
         if counts.get(channel.id)
     }
 
-    def messages(topics: Collection[str]) -> Iterator[tuple[str, str, int, bytes]]:
-        for schema, channel, message in reader.iter_messages(topics=list(topics)):
-            yield channel.topic, schema.name if schema else "", message.log_time, message.data
-
-    return declared, messages
+    return declared, lambda topics: map(_row, reader.iter_messages(list(topics)))
 
 
 def _streamed(path: Path) -> tuple[dict[str, Declared], Messages]:
     """Return topics and messages of an MCAP from its start to where it ends or is damaged."""
-    from mcap.records import Channel, Message, Schema
-    from mcap.stream_reader import StreamReader
+    from mcap.reader import NonSeekingReader
 
     declared: dict[str, Declared] = {}
 
-    def records() -> Iterator[tuple[Any, Any, Any]]:
-        schemas: dict[int, Any] = {}
-        channels: dict[int, Any] = {}
+    def records(topics: Collection[str] | None = None) -> Iterator[tuple[Any, Any, Any]]:
         with path.open("rb") as file:
-            for record in StreamReader(file, validate_crcs=True).records:
-                if isinstance(record, Schema):
-                    schemas[record.id] = record
-                elif isinstance(record, Channel):
-                    channels[record.id] = record
-                elif isinstance(record, Message):
-                    channel = channels[record.channel_id]
-                    yield schemas.get(channel.schema_id), channel, record
-
-    def messages(topics: Collection[str]) -> Iterator[tuple[str, str, int, bytes]]:
-        for schema, channel, record in records():
-            if channel.topic in topics:
-                yield channel.topic, schema.name if schema else "", record.log_time, record.data
+            yield from NonSeekingReader(file, validate_crcs=True).iter_messages(topics, log_time_order=False)
 
     try:
         for schema, channel, _ in records():
@@ -268,7 +249,12 @@ def _streamed(path: Path) -> tuple[dict[str, Declared], Messages]:
     except Exception:  # noqa: BLE001  libraries raise anything
         if not declared:
             raise
-    return declared, messages
+    return declared, lambda topics: map(_row, records(topics))
+
+
+def _row(record: tuple[Any, Any, Any]) -> tuple[str, str, int, bytes]:
+    schema, channel, message = record
+    return channel.topic, schema.name if schema else "", message.log_time, message.data
 
 
 def _declared(channel: Any, schema: Any) -> Declared:
