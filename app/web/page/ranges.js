@@ -59,7 +59,7 @@ export function bandExtent(lower, upper, from, to) {
 }
 
 // What an axis spans: lines once they have settled, bands, and nearly all of the dots; of the rest what is not far from
-// these. What is left lies outside, where edges.js marks it: one wild value does not flatten all others.
+// these. What is left lies outside, where drawing.js marks it: one wild value does not flatten all others.
 export function shownExtent({ lines = [], bands = [], dots = [] }, from, to) {
   const settled = from + Math.ceil(SETTLING * (to - from));
   let [low, high] = extent(lines, settled, to);
