@@ -16,8 +16,9 @@ import numpy as np
 
 from estimators.compiled.context import steps_of
 from estimators.compiled.model import compile_model
+from estimators.diagnostics.calibration import held_inputs
 from estimators.fold import Fold
-from estimators.log import INPUT, READING, RESET, Log, truth_of
+from estimators.log import READING, RESET, Log, truth_of
 from estimators.model.hybrid import gathered, places
 from estimators.model.state_space import StateSpaceModel
 from estimators.numerics.linalg import wrapped
@@ -89,7 +90,8 @@ def windows(
         stretches: Number of stretches of time (`Windows.block`).
     """
     t = log.events.t
-    u = _inputs(physics, log)
+    told = held_inputs(physics, log.events)
+    u = np.where(np.isfinite(told), told, physics.default_inputs)
     target, place = places(physics, corrects), places(physics, features)
     values = gathered(known, u, place)
     compiled = compile_model(physics)
@@ -116,18 +118,6 @@ def windows(
     columns: list[Any] = list(zip(*found, strict=True)) or [()] * 6
     rest: list[Any] = [np.array(c, kind) for c, kind in zip(columns[2:], "ddl?", strict=True)]
     return Windows(np.reshape(columns[0], (-1, len(features))), np.reshape(columns[1], (-1, len(corrects))), *rest)
-
-
-def _inputs(model: StateSpaceModel, log: Log) -> np.ndarray:
-    """Return the inputs that hold from each event on (events, nu)."""
-    u = np.full((log.n, model.nu), np.nan)
-    given = log.events.kind == INPUT
-    u[given] = log.value[: log.n, : model.nu][given]
-    row = np.arange(log.n)
-    for j, item in enumerate(model.inputs):
-        last = np.maximum.accumulate(np.where(np.isfinite(u[:, j]), row, -1))
-        u[:, j] = np.where(last >= 0, u[np.maximum(last, 0), j], item.default)
-    return u
 
 
 def _rates(
