@@ -36,7 +36,7 @@ from estimators.registry import find_estimator
 from estimators.track import GATED, MISSING, USED
 from estimators.tuning import Tuning
 
-from .terms import Reader, Statements, number
+from .terms import COMPARISONS, Reader, Statements, number
 
 FILTERS = ("kf", "kf-steady", "ekf")
 """Filters that are written as C."""
@@ -478,6 +478,6 @@ def _identifier(name: str) -> str:
 
 
 def _cycles(operations: Sequence[str]) -> int:
-    simple = {"+", "-", "*", "?", *Reader.COMPARISONS}
+    simple = {"+", "-", "*", "?", *COMPARISONS}
     counts = Counter(operations)
     return sum(n * (1 if item in simple else CYCLES.get(item, FUNCTION_CYCLES)) for item, n in counts.items())

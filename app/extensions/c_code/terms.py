@@ -13,10 +13,11 @@ Source: Griewank & Walther (2008), Evaluating Derivatives, chapter 3 (forward mo
 from __future__ import annotations
 
 import math
+import operator
 from collections import Counter
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from types import BuiltinFunctionType, CellType, FunctionType, ModuleType, SimpleNamespace
-from typing import Any, ClassVar
+from typing import Any
 
 import numpy as np
 
@@ -41,6 +42,35 @@ NUMPY = {
     "greater_equal": ">=", "equal": "==", "not_equal": "!=",
 }  # fmt: skip
 """NumPy's names of operations, where they are others."""
+
+
+COMPARISONS: dict[str, Callable[[Any, Any], bool]] = {
+    "<": operator.lt, "<=": operator.le, ">": operator.gt, ">=": operator.ge, "==": operator.eq, "!=": operator.ne,
+}  # fmt: skip
+
+ARITHMETIC: dict[str, Callable[[Any, Any], Any]] = {
+    "+": operator.add, "-": operator.sub, "*": operator.mul, "/": lambda a, b: float(np.float64(a) / np.float64(b)),
+}  # fmt: skip
+"""Operations on numbers, and COMPARISONS; those by other names are functions of `math`."""
+
+SLOPES: dict[str, Callable[[Any, Any], Any]] = {
+    "sin": lambda value, a: a.cos(),
+    "cos": lambda value, a: -a.sin(),
+    "tan": lambda value, a: 1.0 + value * value,
+    "asin": lambda value, a: 1.0 / (1.0 - a * a).sqrt(),
+    "acos": lambda value, a: -1.0 / (1.0 - a * a).sqrt(),
+    "atan": lambda value, a: 1.0 / (1.0 + a * a),
+    "sinh": lambda value, a: a.cosh(),
+    "cosh": lambda value, a: a.sinh(),
+    "tanh": lambda value, a: 1.0 - value * value,
+    "exp": lambda value, a: value,
+    "expm1": lambda value, a: value + 1.0,
+    "log": lambda value, a: 1.0 / a,
+    "log1p": lambda value, a: 1.0 / (1.0 + a),
+    "sqrt": lambda value, a: 0.5 / value,
+    "fabs": lambda value, a: a.reader.term("?", a < 0.0, -1.0, 1.0),
+}
+"""Derivatives of the functions of one argument a, from their value at a."""
 
 
 class Term:
@@ -159,11 +189,6 @@ class UnmergedError(Exception):
 class Reader:
     """Runs a model's functions on symbols; terms that are equal are one."""
 
-    COMPARISONS: ClassVar[dict[str, Callable[[Any, Any], bool]]] = {
-        "<": lambda a, b: a < b, "<=": lambda a, b: a <= b, ">": lambda a, b: a > b, ">=": lambda a, b: a >= b,
-        "==": lambda a, b: a == b, "!=": lambda a, b: a != b,
-    }  # fmt: skip
-
     def __init__(self) -> None:
         self._terms: dict[tuple[Any, ...], Term] = {}
         self._given: tuple[tuple[Term, bool], ...] = ()  # choices of the callers
@@ -195,12 +220,12 @@ class Reader:
 
     def _known(self, operation: str, of: tuple[Term, ...]) -> Term | None:
         values = [item.constant for item in of]
-        if operation in self.COMPARISONS or operation == "?":
-            if operation == "?":
-                return of[1] if of[1] is of[2] else None
+        if operation == "?":
+            return of[1] if of[1] is of[2] else None
+        if operation in COMPARISONS:
             return None
         if all(value is not None for value in values):
-            return self.constant(_value(operation, values))  # type: ignore[arg-type]
+            return self.constant((ARITHMETIC.get(operation) or getattr(math, operation))(*values))
         a, b = (values + [None])[:2]
         if operation == "+" and 0.0 in (a, b):
             return of[1] if a == 0.0 else of[0]
@@ -216,11 +241,11 @@ class Reader:
 
     def choose(self, condition: Term) -> bool:
         """Return the outcome of a condition on the way through the function that is followed now."""
-        if condition.operation not in self.COMPARISONS:
+        if condition.operation not in COMPARISONS:
             condition = self.term("!=", condition, 0.0)
         values = [item.constant for item in condition.of]
         if None not in values:
-            return self.COMPARISONS[condition.operation](*values)
+            return COMPARISONS[condition.operation](*values)
         for known, outcome in (*self._given, *self._path):
             if known is condition:
                 return outcome
@@ -364,7 +389,7 @@ class Reader:
     def _derivative(self, term: Term, symbol: Term, known: Mapping[int, Term]) -> Any:
         if term is symbol:
             return self.constant(1.0)
-        if term.operation in ("symbol", "constant", "floor") or term.operation in self.COMPARISONS:
+        if term.operation in ("symbol", "constant", "floor") or term.operation in COMPARISONS:
             return self.constant(0.0)
         if term.operation == "?":
             condition, a, b = term.of
@@ -389,56 +414,7 @@ class Reader:
                 return first if db.constant == 0.0 else first + value * self.term("log", a) * db
             case "atan2":
                 return (b * da - a * db) / (a * a + b * b)
-        return da * self._slope(term, a)
-
-    def _slope(self, value: Any, a: Any) -> Any:
-        """Return the derivative of a function of one argument, `value` at a."""
-        one: Any = self.constant(1.0)
-        match value.operation:
-            case "sin":
-                return a.cos()
-            case "cos":
-                return -a.sin()
-            case "tan":
-                return one + value * value
-            case "asin":
-                return one / (one - a * a).sqrt()
-            case "acos":
-                return -one / (one - a * a).sqrt()
-            case "atan":
-                return one / (one + a * a)
-            case "sinh":
-                return a.cosh()
-            case "cosh":
-                return a.sinh()
-            case "tanh":
-                return one - value * value
-            case "exp":
-                return value
-            case "expm1":
-                return value + one
-            case "log":
-                return one / a
-            case "log1p":
-                return one / (one + a)
-            case "sqrt":
-                return 0.5 / value
-        return self.term("?", self.term("<", a, 0.0), -1.0, 1.0)  # fabs
-
-
-def _value(operation: str, values: list[float]) -> float:
-    """Return the value of an operation on numbers."""
-    a, b = (values + [0.0])[:2]
-    match operation:
-        case "+":
-            return a + b
-        case "-":
-            return a - b
-        case "*":
-            return a * b
-        case "/":
-            return float(np.float64(a) / np.float64(b))
-    return float(getattr(math, operation)(*values))
+        return da * SLOPES[term.operation](term, a)
 
 
 def _names(function: FunctionType) -> Iterator[str]:
@@ -488,7 +464,7 @@ class Statements:
             text = self._text(item)
             if uses[id(item)] > 1 and item.operation not in ("symbol", "constant"):
                 name = f"t{len(self.lines)}"
-                kind = "int" if item.operation in Reader.COMPARISONS else "real"
+                kind = "int" if item.operation in COMPARISONS else "real"
                 self.lines.append(f"const {kind} {name} = {text};")
                 text = name
             self._texts[id(item)] = text
