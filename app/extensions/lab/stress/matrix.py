@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import replace
+from functools import partial
 
 import numpy as np
 
@@ -124,59 +125,55 @@ def _fault(kind: str, **given: object) -> Callable[[float, float], list[Fault]]:
     return lambda start, end: [Fault(kind, start=start, end=end, **given)]  # type: ignore[arg-type]
 
 
+def _damage(
+    name: str, causes: frozenset[str], nudge: tuple[str, str, float], kind: str, *, subjects: frozenset[str],
+    shifts: bool = False, **given: object,
+) -> Mistake:  # fmt: skip
+    """Return a fault of that kind of the source, which `nisus check` knows as `nudge`."""
+    return Mistake(name, causes, subjects, fault=_fault(kind, **given), shifts=shifts, nudges=(nudge,))
+
+
 def _late(sensor: str, seconds: float) -> Callable[[float, float], list[Fault]]:
     """Measurements that are stamped so long after they were taken, when they arrive."""
     kinds = ("clock_jump", "delay")
     return lambda start, end: [Fault(kind, sensor, start=start, end=end, size=seconds) for kind in kinds]
 
 
-def _rows(model: StateSpaceModel, sensor: Sensor, tuning: Tuning) -> list[tuple[str | None, float]]:
-    """The rows of a sensor that are tried, each with its standard deviation: its own row, or the first of several."""
-    start = model.row_start[model.sensor_names.index(sensor.name)]
-    row = sensor.rows[0].name if len(sensor.rows) > 1 else None
-    return [(row, float(np.sqrt(tuning.r[start])))]
-
-
 def _of_sensors(model: StateSpaceModel, tuning: Tuning, sensors: Sequence[Sensor]) -> Iterator[Mistake]:
     for sensor in sensors:
-        name = sensor.name
+        name, std = sensor.name, float(np.sqrt(tuning.r[model.row_start[model.sensor_names.index(sensor.name)]]))
         own = frozenset({name, *(row.name for row in sensor.rows)})
-        for row, std in _rows(model, sensor, tuning):
-            label = name if row is None else f"{name}.{row}"
-            for size in (2.0, 5.0, 20.0):
-                fault = _fault("bias", sensor=name, row=row, size=size * std)
-                plain = Mistake(f"{label} +{size:g} σ", SHIFT, own, fault=fault, shifts=True)
-                known = ((SENSOR, label, size * std),)
-                yield replace(plain, size=size * std, unit=sensor.rows[0].unit, nudges=known)
-            for seconds in (10.0, 100.0):
-                drift = _fault("drift", sensor=name, row=row, size=std / seconds)
-                drifting = Mistake(f"{label} drifts 1 σ in {seconds:g} s", SHIFT | {"correlated"}, own, fault=drift)
-                yield replace(drifting, shifts=True, nudges=((DRIFT, label, std / seconds),))
-            noisy = _fault("noise", sensor=name, row=row, size=3.0 * std)
-            times_ten = ((R_, label, 0.1 - 1.0),)  # the twin's R is a tenth of the asset's
-            yield Mistake(f"{label} noise x3", frozenset({"narrow", "refused"}), own, fault=noisy, nudges=times_ten)
-            spikes = _fault("spike", sensor=name, row=row, size=10.0 * std, rate=0.01)
-            known = ((SPIKES, label, 10.0 * std),)
-            yield Mistake(f"{label} spikes 1 %", frozenset({"spiky"}), own, fault=spikes, nudges=known)
-            for factor in (1.02, 1.1):
-                scaled = _fault("scale", sensor=name, row=row, size=factor)
-                known = ((SCALE, label, factor - 1.0),)
-                yield Mistake(f"{label} x{factor:g}", MODEL, own, fault=scaled, shifts=True, nudges=known)
-        held = ((STUCK, name, 1.0),)
-        yield Mistake(f"{name} stuck", frozenset({"stuck"}), own, fault=_fault("stuck", sensor=name), nudges=held)
-        lost = _fault("silence", sensor=name)
+        # Of several rows the first is tried.
+        row = sensor.rows[0].name if len(sensor.rows) > 1 else None
+        label = name if row is None else f"{name}.{row}"
+        make = partial(_damage, subjects=own, sensor=name, row=row)
+        for sigmas in (2.0, 5.0, 20.0):
+            words, size = f"{label} +{sigmas:g} σ", sigmas * std
+            biased = make(words, SHIFT, (SENSOR, label, size), "bias", shifts=True, size=size)
+            yield replace(biased, size=size, unit=sensor.rows[0].unit)
+        for seconds in (10.0, 100.0):
+            words, rate = f"{label} drifts 1 σ in {seconds:g} s", std / seconds
+            yield make(words, SHIFT | {"correlated"}, (DRIFT, label, rate), "drift", shifts=True, size=rate)
+        # The twin's R is a tenth of the asset's.
+        nudge = (R_, label, 0.1 - 1.0)
+        yield make(f"{label} noise x3", frozenset({"narrow", "refused"}), nudge, "noise", size=3.0 * std)
+        nudge = (SPIKES, label, 10.0 * std)
+        yield make(f"{label} spikes 1 %", frozenset({"spiky"}), nudge, "spike", size=10.0 * std, rate=0.01)
+        for factor in (1.02, 1.1):
+            nudge = (SCALE, label, factor - 1.0)
+            yield make(f"{label} x{factor:g}", MODEL, nudge, "scale", shifts=True, size=factor)
+        yield _damage(f"{name} stuck", frozenset({"stuck"}), (STUCK, name, 1.0), "stuck", subjects=own, sensor=name)
         if len(model.sensors) > 1 and not sensor.by_chance:
-            yield Mistake(f"{name} silent", frozenset({"silent"}), own, fault=lost)
+            yield Mistake(f"{name} silent", frozenset({"silent"}), own, fault=_fault("silence", sensor=name))
     if len(model.sensors) > 1:
         yield Mistake("all stuck", frozenset({"stuck"}), fault=_fault("stuck"))
     yield Mistake("all silent", frozenset({"silent", "stale"}), fault=_silent(model))
     pair = _alike(sensors)
     if pair is not None:
         first, second = pair
-        swapped = _fault("swap", sensor=first, other=second)
         # With its mean each gets the noise of the other.
-        known = ((SWAP, f"{first}{SWAPPED}{second}", 1.0),)
-        yield Mistake(f"{first} and {second} swapped", MODEL, frozenset(pair), fault=swapped, nudges=known)
+        nudge, own = (SWAP, f"{first}{SWAPPED}{second}", 1.0), frozenset(pair)
+        yield _damage(f"{first} and {second} swapped", MODEL, nudge, "swap", subjects=own, sensor=first, other=second)
 
 
 def _silent(model: StateSpaceModel) -> Callable[[float, float], list[Fault]]:
@@ -199,22 +196,18 @@ def _of_inputs(model: StateSpaceModel, events: Events) -> Iterator[Mistake]:
         values = told[:, k][np.isfinite(told[:, k])]
         if not values.size:
             continue
+        make = partial(_damage, subjects=frozenset({f"input {item.name}"}), shifts=True, input=item.name)
         # Half of what it varies by, or a quarter of what it is where it does not.
         size = float(0.5 * np.ptp(values)) or float(0.25 * np.abs(values).mean())
         if size:
-            biased = _fault("bias", input=item.name, size=size)
-            name = f"{item.name} +{size:.3g} {item.unit}"
-            own = frozenset({f"input {item.name}"})
-            plain = Mistake(name, INPUT_WRONG, own, fault=biased, size=size, unit=item.unit, shifts=True)
-            yield replace(plain, nudges=((INPUT_, item.name, size),))
+            words = f"{item.name} +{size:.3g} {item.unit}"
+            biased = make(words, INPUT_WRONG, (INPUT_, item.name, size), "bias", size=size)
+            yield replace(biased, size=size, unit=item.unit)
             for factor in (1.1, 1.3):
-                scaled = _fault("scale", input=item.name, size=factor)
-                known = ((INPUT_SCALE, item.name, factor - 1.0),)
-                yield Mistake(f"{item.name} x{factor:g}", INPUT_WRONG, own, fault=scaled, shifts=True, nudges=known)
+                nudge = (INPUT_SCALE, item.name, factor - 1.0)
+                yield make(f"{item.name} x{factor:g}", INPUT_WRONG, nudge, "scale", size=factor)
         if np.ptp(values):
-            lost = _fault("silence", input=item.name)
-            own, held = frozenset({f"input {item.name}"}), ((INPUT_STUCK, item.name, 1.0),)
-            yield Mistake(f"{item.name} lost", INPUT_WRONG, own, fault=lost, shifts=True, nudges=held)
+            yield make(f"{item.name} lost", INPUT_WRONG, (INPUT_STUCK, item.name, 1.0), "silence")
 
 
 def _of_time(sensors: Sequence[Sensor]) -> Iterator[Mistake]:
@@ -224,17 +217,15 @@ def _of_time(sensors: Sequence[Sensor]) -> Iterator[Mistake]:
     yield Mistake("neighbours in the wrong order", NOTHING, fault=_fault("reorder", rate=0.5))
     clock = frozenset({"clock", "silent", "stale", "shifted"})
     for sensor in sensors:
-        name = sensor.name
-        jump = _fault("clock_jump", sensor=name, size=-1.0)
-        known = ((DELAY, name, -1.0),)
-        yield Mistake(f"clock of {name} 1 s behind", clock | MODEL, frozenset({name}), fault=jump, nudges=known)
+        name, own = sensor.name, frozenset({sensor.name})
+        jump, known = _fault("clock_jump", sensor=name, size=-1.0), ((DELAY, name, -1.0),)
+        yield Mistake(f"clock of {name} 1 s behind", clock | MODEL, own, fault=jump, nudges=known)
         for seconds in (0.5, 3.0):
-            known = ((DELAY, name, seconds),)
-            late = _late(name, seconds)
-            yield Mistake(f"{name} {seconds:g} s late", clock | MODEL, frozenset({name}), fault=late, nudges=known)
+            late, known = _late(name, seconds), ((DELAY, name, seconds),)
+            yield Mistake(f"{name} {seconds:g} s late", clock | MODEL, own, fault=late, nudges=known)
         again = _fault("duplicate", sensor=name, count=4, every=0.001)
         repeated = frozenset({"duplicate", "stuck", "correlated", "wide"})
-        yield Mistake(f"{name} said five times", repeated, frozenset({name}), fault=again)
+        yield Mistake(f"{name} said five times", repeated, own, fault=again)
 
 
 def _of_model(model: StateSpaceModel, tuning: Tuning, asset: bool) -> Iterator[Mistake]:
