@@ -45,7 +45,11 @@ class AlertStore:
         """When to try again after a failure, monotonic, s; 0 without one."""
 
     def open(self, rules: StoredRules, deliveries: Deliveries) -> str:
-        """Continue with the alerts of the store; return why it cannot be used, or empty."""
+        """Keep the alerts of these rules and receivers, and continue with those of the store, if it is not read yet.
+
+        Return why it cannot be used, or empty.
+        """
+        self._rules, self._deliveries = rules, deliveries
         store, self._unread = self._unread, None
         if store is None:
             return ""
@@ -66,24 +70,22 @@ class AlertStore:
         self._store = store
         return ""
 
-    def send(self, rules: StoredRules, deliveries: Deliveries, due: Iterable[tuple[Any, AlertMessage]]) -> None:
+    def send(self, due: Iterable[tuple[Any, AlertMessage]]) -> None:
         """Put alerts, each with its rule, into the queues of their receivers, once they are in the store."""
-        meant = [(alert, deliveries.names(rule.to)) for rule, alert in due]
-        counts = deliveries.counts()
-        if meant or counts != self._written:
-            self._write(rules, deliveries, meant, counts)
+        meant = [(alert, self._deliveries.names(rule.to)) for rule, alert in due]
+        if meant or self._deliveries.counts() != self._written:
+            self._write(meant)
         for alert, names in meant:
-            deliveries.put(alert, names)
+            self._deliveries.put(alert, names)
 
-    def _write(
-        self, rules: StoredRules, deliveries: Deliveries, due: Sequence[tuple[AlertMessage, Sequence[str]]], counts: Any
-    ) -> None:
+    def _write(self, due: Sequence[tuple[AlertMessage, Sequence[str]]]) -> None:
         if self._store is None or time.monotonic() < self._retry:
             return
-        waiting = [*deliveries.waiting(), *((name, alert) for alert, names in due for name in names)]
+        counts = self._deliveries.counts()
+        waiting = [*self._deliveries.waiting(), *((name, alert) for alert, names in due for name in names)]
         kept = {
             "written": time.time(),
-            "open": rules.state(),
+            "open": self._rules.state(),
             "waiting": [(name, alert.model_dump(mode="json")) for name, alert in waiting],
         }
         try:
@@ -97,11 +99,11 @@ class AlertStore:
             self._notices.say(f"store {self._store.path}: it is written again")
         self._written, self._retry = counts, 0.0
 
-    def close(self, rules: StoredRules, deliveries: Deliveries) -> None:
+    def close(self) -> None:
         """Write the rest; the store stays open."""
         if self._store is not None:
             self._retry = 0.0
-            self.send(rules, deliveries, ())
+            self.send(())
             self._store = None
 
 

@@ -107,7 +107,7 @@ class Publisher:
         self._engine.grown -= {self._awake}
         self._thread.stop(2.0)
         self._end()
-        self._store.close(self._parts.rules, self._parts.deliveries)
+        self._store.close()
 
     def json(self) -> dict[str, Any]:
         """Return the state of outputs, receivers and alerts."""
@@ -218,5 +218,5 @@ class Publisher:
     def _look(self, parts: Parts) -> None:
         """Put the alerts that are due into the queues of their receivers."""
         message = state_message(self._engine)
-        self._store.send(parts.rules, parts.deliveries, parts.rules.look(self._engine, message))
+        self._store.send(parts.rules.look(self._engine, message))
         parts.deliveries.beat(message.twin, message.health)

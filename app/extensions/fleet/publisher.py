@@ -80,7 +80,7 @@ class FleetPublisher:
         """Disconnect."""
         self._thread.stop(2.0)
         self._jobs.stop()
-        self._store.close(self._rules, self._deliveries)
+        self._store.close()
         if self._mqtt is not None:
             self._mqtt.stop()
         self._print()
@@ -115,7 +115,7 @@ class FleetPublisher:
 
     def _alert(self, names: Sequence[str], table: FleetTable) -> None:
         """Put the alerts that are due into the queues of their receivers."""
-        self._store.send(self._rules, self._deliveries, self._rules.look(names, table))
+        self._store.send(self._rules.look(names, table))
         if not self._fleet.failure:  # a fleet that stands still does not tell that it runs
             self._deliveries.beat(self._fleet.plan.name, HEALTH_NAMES[table.health.max()])
 

@@ -102,7 +102,7 @@ class Process:
     def look(self, t, **fields):
         self.looked.now = t
         due = self.looked.rules.look(self.looked.engine, state(**fields))
-        self.store.send(self.looked.rules, self.deliveries, due)
+        self.store.send(due)
         return self
 
     def deliver(self):
@@ -139,7 +139,7 @@ def test_an_alert_is_stored_before_it_is_sent_and_told_once(tmp_path, monkeypatc
     assert fourth.deliver() == []
     fourth.look(SETTLE_S)
     assert fourth.deliver() == [("resolved", number)]
-    fourth.store.close(fourth.looked.rules, fourth.deliveries)
+    fourth.store.close()
     fourth.kill()
     fifth = Process(tmp_path, monkeypatch, **RULE).look(0.0).look(100.0)
     assert fifth.deliver() == [] and fifth.said() == []
@@ -165,7 +165,7 @@ def test_a_part_that_cannot_be_used_is_one_line_and_alerts_are_sent(tmp_path, mo
     assert line.startswith(f"store {path}: {reason}") and line == process.problem and "\n" not in line
     assert line.endswith("; alerts are not kept over a restart")
     assert [status for status, _ in process.look(0.0, **BAD).deliver()] == ["firing"]
-    process.store.close(process.looked.rules, process.deliveries)
+    process.store.close()
     process.kill()
     assert path.read_bytes()[100:] == before
 
