@@ -52,8 +52,9 @@ class Forwarded(Response):
         except OSError:
             await PlainTextResponse(f"Nisus: {self._twin.name} does not answer.\n", 502)(scope, receive, send)
             return
-        sender = asyncio.ensure_future(self._send(scope, receive, writer))
-        answer = asyncio.ensure_future(self._answer(scope, reader, send))
+        connection = h11.Connection(h11.CLIENT)
+        sender = asyncio.ensure_future(self._send(connection, scope, receive, writer))
+        answer = asyncio.ensure_future(self._answer(connection, reader, send))
         try:
             await asyncio.wait({sender, answer}, return_when=asyncio.FIRST_COMPLETED)
             if sender.done() and sender.result():
@@ -68,7 +69,9 @@ class Forwarded(Response):
             answer.cancel()
             writer.close()
 
-    async def _send(self, scope: Scope, receive: Receive, writer: asyncio.StreamWriter) -> bool:
+    async def _send(
+        self, connection: h11.Connection, scope: Scope, receive: Receive, writer: asyncio.StreamWriter
+    ) -> bool:
         """Send the request; return True once the client has gone."""
         target = quote(self._path).encode()
         query = scope["query_string"]
@@ -78,7 +81,6 @@ class Forwarded(Response):
             headers += [(b"transfer-encoding", b"chunked")]
         headers += [*credentials(self._twin, scope), (b"host", f"127.0.0.1:{self._twin.port}".encode())]
         headers += [(b"connection", b"close")]
-        connection = h11.Connection(h11.CLIENT)
         request = h11.Request(method=scope["method"], target=target + (b"?" + query if query else b""), headers=headers)
         with suppress(OSError, h11.LocalProtocolError):
             writer.write(connection.send(request) or b"")
@@ -93,11 +95,9 @@ class Forwarded(Response):
             pass
         return True
 
-    async def _answer(self, scope: Scope, reader: asyncio.StreamReader, send: Send) -> bool:
+    async def _answer(self, connection: h11.Connection, reader: asyncio.StreamReader, send: Send) -> bool:
         """Pass the answer back; return whether there was one."""
-        connection, begun = h11.Connection(h11.CLIENT), False
-        connection.send(h11.Request(method=scope["method"], target="/", headers=[("host", "x")]))
-        connection.send(h11.EndOfMessage())
+        begun = False
         # Relative, as the service may be behind a proxy at any path.
         origin, root = f"http://127.0.0.1:{self._twin.port}/".encode(), b"./" + b"../" * (self._path.count("/") - 1)
         with suppress(OSError, h11.RemoteProtocolError):
