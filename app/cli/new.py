@@ -153,7 +153,10 @@ def fit_draft(drafted: DraftPlan) -> DraftPlan:
 def roles_json(drafted: DraftPlan) -> dict[str, Any]:
     """Return the role of every signal, and the check of a fitted draft, for scripts."""
     check = drafted.check
-    sensors = [one._asdict() | {"correlation": one.correlation.value} for one in check.sensors] if check else []
+    sensors = [
+        one._asdict() | {key: getattr(one, key).value for key in ("coverage", "correlation", "held_out")}
+        for one in (check.sensors if check else ())
+    ]
     return {
         "check": {**check._asdict(), "sensors": sensors, "consistent": not check.reason} if check else None,
         "roles": [

@@ -530,9 +530,9 @@ def check_lines(check: DraftCheck) -> list[str]:
         if not one.n:
             lines.append(f"{one.name}: no measurement with a prediction in the checked part")
             continue
-        held_out = f", {100 * one.held_out:.1f} % when held out" if math.isfinite(one.held_out) else ""
+        held_out = f", {100 * one.held_out.value:.1f} % when held out" if math.isfinite(one.held_out.value) else ""
         lines.append(
-            f"{one.name}: {100 * one.coverage:.1f} % of {one.n:,} measurements in the 95 % band{held_out}, "
+            f"{one.name}: {100 * one.coverage.value:.1f} % of {one.n:,} measurements in the 95 % band{held_out}, "
             f"correlation of successive innovations {one.correlation.value:+.2f}"
         )
     return lines

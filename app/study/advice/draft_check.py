@@ -11,7 +11,7 @@ from typing import NamedTuple
 import numpy as np
 
 from estimators.diagnostics.consistency import NisVerdict
-from estimators.diagnostics.intervals import correlation_interval, share_interval
+from estimators.diagnostics.intervals import Interval, correlation_interval, share_interval
 from estimators.diagnostics.score import MAX_NIS_FACTOR, nis_verdict
 from estimators.fold import Fold, folded
 from estimators.log import READING, Log
@@ -170,7 +170,7 @@ class DraftFold:
 
     def check(self, span: float) -> DraftCheck:
         """Return the check on the parts that were not fitted; `span` is the length of the recording, s."""
-        found, late, alone, ratios = [], {}, {}, {}
+        found, late, ratios = [], {}, {}
         failed = np.zeros(len(self._sensors), np.int64)
         for k, reads in enumerate(self._sensors):
             e = late[reads.name] = self._innovations(self._fold, k)
@@ -180,15 +180,15 @@ class DraftFold:
             ratios[reads.name] = _power(after) / max(_power(before), 1e-300)
             item = next(item for item in self.drafted.states if reads in item.sensors)
             others = [one for one in item.sensors if one.name not in self.drafted.held_out and one is not reads]
+            alone = e[:0]
             if reads.name in self.drafted.held_out:
-                alone[reads.name] = e
+                alone = e
             elif others and not reads.rate and not all(one.rate for one in others):
                 without = replace(self._tuning, used=self._tuning.used & (np.arange(len(self._sensors)) != k))
-                alone[reads.name] = self._innovations(self._folded(without), k)
-            held_out = _coverage(alone.get(reads.name, e[:0]))
-            found.append(SensorCheck(reads.name, e.size, _coverage(e), correlation_interval(e), held_out))
+                alone = self._innovations(self._folded(without), k)
+            found.append(SensorCheck(reads.name, e.size, _coverage(e), correlation_interval(e), _coverage(alone)))
         fitted, nis = (self._verdict(self._fitted == part) for part in (True, False))
-        reason, wide = _reason(nis, fitted, self._sensors, found, late, alone, ratios, alternate=self._split.alternate)
+        reason, wide = _reason(nis, fitted, self._sensors, found, late, ratios, alternate=self._split.alternate)
         if failed.any():
             name, count = self._sensors[int(np.argmax(failed))].name, int(failed.max())
             reason, wide = f"the estimate of {name} diverged: {count:,} measurements have no prediction; omit it", False
@@ -200,8 +200,8 @@ class DraftFold:
         return nis_verdict(self._fold.track.select(part), self._log.events.select(part), self._fold.model)
 
 
-def _coverage(e: np.ndarray) -> float:
-    return float(np.mean(np.abs(e) <= BAND_SIGMA)) if e.size else np.nan
+def _coverage(e: np.ndarray) -> Interval:
+    return share_interval(np.abs(e) <= BAND_SIGMA, e)
 
 
 def _power(e: np.ndarray) -> float:
@@ -223,7 +223,6 @@ def _reason(
     sensors: Sequence[Reads],
     checks: Sequence[SensorCheck],
     late: Mapping[str, np.ndarray],
-    alone: Mapping[str, np.ndarray],
     ratios: Mapping[str, float],
     *,
     alternate: bool,
@@ -238,7 +237,6 @@ def _reason(
         sensors: Sensors.
         checks: Their checks.
         late: Their innovations on the checked parts, σ.
-        alone: The same of those that were held out.
         ratios: Power of the innovations on the second half of the recording over that on the first.
         alternate: Whether parts of both halves were fitted.
     """
@@ -246,15 +244,13 @@ def _reason(
     if sum(one.n for one in known) < MIN_CHECKED or not nis.place:
         part = "checked parts have" if alternate else "second half has"
         return f"the {part} fewer than {MIN_CHECKED} measurements; record a longer log", False
-    shares = {one.name: share_interval(np.abs(late[one.name]) <= BAND_SIGMA, late[one.name]) for one in known}
-    narrow, wide = min(known, key=lambda one: one.coverage), max(known, key=lambda one: -_power(late[one.name]))
+    narrow, wide = min(known, key=lambda one: one.coverage.value), max(known, key=lambda one: -_power(late[one.name]))
     if alternate:
         changed = max(ratios, key=lambda name: abs(np.log(max(ratios[name], 1e-300))))
         if abs(np.log(max(ratios[changed], 1e-300))) > np.log(MAX_CHANGE):
             return _varies(changed), False
-    good = shares[narrow.name].high >= MIN_COVERAGE
     place = "inside" if _within_fit_error(nis, fitted) else nis.place
-    if place == "above" or not good:
+    if place == "above" or not narrow.coverage.high >= MIN_COVERAGE:
         far = {one.name: float(np.mean(np.abs(late[one.name]) > FAR_SIGMA)) for one in known}
         worst = max(far, key=lambda name: far[name])
         if ratios[narrow.name] > MAX_NIS_FACTOR and not alternate:
@@ -276,34 +272,33 @@ def _reason(
             f"R.{contrary.name} with nisus tune {YAML_NAME}",
             False,
         )
-    if place == "below" or any(one.low > MAX_COVERAGE for one in shares.values()):
+    if place == "below" or any(one.coverage.low > MAX_COVERAGE for one in known):
         reads = next(one for one in sensors if one.name == wide.name)
         if reads.r <= MAX_FLOOR_FACTOR * reads.signal.resolution**2 / 12.0:
             return (
                 f"{wide.name} varies less than its resolution of {reads.signal.resolution:.3g} "
                 f"{reads.signal.series.unit or 'units'}, so its bands are wider than needed; they are valid",
-                narrow.coverage >= MIN_COVERAGE,
+                narrow.coverage.value >= MIN_COVERAGE,
             )
         if ratios[wide.name] * MAX_NIS_FACTOR < 1.0 and not alternate:
             why = f"{wide.name} moves less {HALVES_DIFFER}; fit all of the log with nisus tune {YAML_NAME}"
-        elif narrow.coverage >= MIN_COVERAGE:
-            widest = max(known, key=lambda one: one.coverage)
+        elif narrow.coverage.value >= MIN_COVERAGE:
+            widest = max(known, key=lambda one: one.coverage.value)
             why = (
-                f"{100 * widest.coverage:.1f} % of {widest.name} are in the 95 % band, so its bands are wider than "
-                f"needed; they are valid (nisus advise {YAML_NAME} --apply compares filters that follow its noise)"
+                f"{100 * widest.coverage.value:.1f} % of {widest.name} are in the 95 % band, so its bands are wider "
+                f"than needed; they are valid (nisus advise {YAML_NAME} --apply compares filters that follow its noise)"
             )
         else:
             why = _varies(wide.name)
-        return why, narrow.coverage >= MIN_COVERAGE
+        return why, narrow.coverage.value >= MIN_COVERAGE
     lasting = max(known, key=lambda one: one.correlation.low)
     if lasting.correlation.low > MAX_CORRELATION:
         return _missing_cause(lasting), False
-    for name, e in alone.items():
-        share = share_interval(np.abs(e) <= BAND_SIGMA, e)
-        if share.high < MIN_COVERAGE:
+    for one in checks:
+        if one.held_out.high < MIN_COVERAGE:
             return (
-                f"predicted from the other sensors alone, {100 * share.value:.1f} % of {name} is in the 95 % band, so "
-                f"its scale or offset changes; omit it",
+                f"predicted from the other sensors alone, {100 * one.held_out.value:.1f} % of {one.name} is in the "
+                "95 % band, so its scale or offset changes; omit it",
                 False,
             )
     return "", False

@@ -117,9 +117,9 @@ class SensorCheck(NamedTuple):
 
     name: str
     n: int
-    coverage: float
+    coverage: Interval
     correlation: Interval
-    held_out: float
+    held_out: Interval
 
 
 class DraftCheck(NamedTuple):

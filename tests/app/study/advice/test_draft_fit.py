@@ -84,7 +84,7 @@ def test_an_asset_whose_halves_differ_is_fitted_to_parts_of_both(tmp_path, step,
     assert drafted.options["adapt"] == "Q"
     # Every other eighth of the measurements was fitted.
     assert check.sensors[0].n == N // 2 and check.start == pytest.approx(N / 8, abs=1.0)
-    assert 0.93 < check.sensors[0].coverage < 0.97
+    assert 0.93 < check.sensors[0].coverage.value < 0.97
     parts = "Fitted to every other of 8 parts (about 6.25 min each), checked on the others"
     assert check.fitted_to == f"The halves of the recording differ. {parts}"
 
@@ -127,7 +127,7 @@ def test_rows_of_two_sources_in_turn_are_not_consistent_though_their_nis_is(tmp_
     level = np.cumsum(rng.normal(0, 0.1, N)) + np.where(np.arange(N) % 2, 1.0, -1.0) + rng.normal(0, 0.1, N)
     found = inspect_recordings([write(tmp_path / "tank.csv", level=level)])
     check = fit_all(plan(found, Roles())).check
-    assert check.sensors[0].correlation.high < -0.2 and 0.90 < check.sensors[0].coverage
+    assert check.sensors[0].correlation.high < -0.2 and 0.90 < check.sensors[0].coverage.value
     assert check.reason.startswith("successive innovations of level alternate (-0.") and check.words.startswith(
         "not con"
     )
@@ -158,6 +158,6 @@ def test_bands_that_are_too_wide_alone_are_conservative(tmp_path):
     columns = {"level": level + rng.normal(0, 0.3, N), "second": level + rng.uniform(-4.0, 4.0, N)}
     found = inspect_recordings([write(tmp_path / "tank.csv", **columns)])
     check = fit_all(plan(found, Roles(sensors=("level",), held_out=("second",)))).check
-    coverage = {one.name: one.coverage for one in check.sensors}
+    coverage = {one.name: one.coverage.value for one in check.sensors}
     assert coverage["second"] > 0.98 and coverage["level"] > 0.9
     assert check.wide and check.words.startswith("conservative: ")
