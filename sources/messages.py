@@ -69,7 +69,7 @@ NO_ROOM = Answer(REFUSED, "the fleet has as many assets as it may have; enlarge 
 CLOSED = Answer(REFUSED, "nothing is folded any more; send it again after a restart")
 
 
-class Rows(NamedTuple):
+class RowBatch(NamedTuple):
     """Messages as rows: times and arrivals (n,), ns; values and their state (n, columns), see `ChannelMapping`."""
 
     t: np.ndarray
@@ -151,7 +151,7 @@ class Messages:
         self._mapping = ChannelMapping(
             [(channels, self._columns, [None] * len(self._columns))], width=width, report=report
         )
-        self._waiting: queue.SimpleQueue[Rows] = queue.SimpleQueue()
+        self._waiting: queue.SimpleQueue[RowBatch] = queue.SimpleQueue()
         self._room = MAX_WAITING
         senders = MAX_FLEET_SENDERS if assets else MAX_SENDERS
         self._sent, self._stored = SentNumbers(senders), SentNumbers(senders)
@@ -192,7 +192,7 @@ class Messages:
             taken = np.array([answer.status == ACCEPTED for answer in answers], np.bool_)
             if taken.any():
                 names = [item[ASSET] if self._assets and ok else "" for item, ok in zip(messages, taken, strict=True)]
-                rows = Rows(t[taken], arrival[taken], values[taken], state[taken], np.array(names, object)[taken])
+                rows = RowBatch(t[taken], arrival[taken], values[taken], state[taken], np.array(names, object)[taken])
                 self._room -= rows.t.size
                 self._waiting.put(rows)
         return answers
@@ -292,7 +292,7 @@ class Messages:
             return AssetEvents(none, np.zeros(0, np.int64), ()) if self._assets else none
         while not self._waiting.empty():
             found.append(self._waiting.get())
-        rows = Rows(*map(np.concatenate, zip(*found, strict=True)))
+        rows = RowBatch(*map(np.concatenate, zip(*found, strict=True)))
         with self._sending:
             self._room += rows.t.size
             self.mark += rows.t.size

@@ -178,7 +178,7 @@ class Scale:
 
 
 @dataclass(frozen=True)
-class Frame:
+class PictureFrame:
     """Pixels of a field's picture: a cell takes `tall` × `wide`, so that distances keep their proportions."""
 
     field: Field
@@ -189,7 +189,7 @@ class Frame:
     reduced: int
 
     @staticmethod
-    def of(field: Field) -> Frame:
+    def of(field: Field) -> PictureFrame:
         """Return the frame of a field, about 150 pixels or larger."""
         rows, columns = plane_shape(field.shape)
         steps = field.steps[-2:] if len(field.shape) > 1 else (max(1.0, columns / 12) * field.steps[0], field.steps[0])
@@ -198,7 +198,7 @@ class Frame:
             ((a, b) for a in range(1, 41) for b in range(1, 9)),
             key=lambda ab: abs(np.log(ab[0] / ab[1] / ratio)) + 0.02 * abs(np.log(ab[1] * columns / 180.0)),
         )
-        return Frame(field, rows, columns, best[0], best[1], reduction(field.shape))
+        return PictureFrame(field, rows, columns, best[0], best[1], reduction(field.shape))
 
     @property
     def height(self) -> int:

@@ -28,7 +28,7 @@ if TYPE_CHECKING:
     from sources.source import Source
 
     from ..engine.compilers import Compiler
-    from ..record.reader import Recorded
+    from ..record.reader import ReadRecording
 
 
 def live_source(twin: Twin, speed: float | None = None) -> Callable[[Callable[[str, str], None]], Source]:
@@ -74,7 +74,7 @@ def opened_twin(
     return OpenedTwin(twin, source, files=twin.files, stamp=stamp, again=read, store=store, archive=made)
 
 
-def recorded_twin(recorded: Recorded) -> Twin:
+def recorded_twin(recorded: ReadRecording) -> Twin:
     """The twin as it was when the recording ended: its YAML, with the last tuning and estimator.
 
     The baseline of the innovations is not part of the tuning and comes from the YAML.

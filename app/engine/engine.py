@@ -35,7 +35,7 @@ from . import commands
 from .batches import BatchSizer
 from .copies import LogTail, Status
 from .execute import execute
-from .feeder import Delivery, Feeder
+from .feeder import Feeder, SourceBatch
 from .jobs import Job, Jobs, LoopThread, run_all
 from .outcomes import Outcomes
 from .running_fold import Keeper, Records, Running, StoredTwin
@@ -101,7 +101,7 @@ class Engine(Running):
         Raises:
             NisusError: If the source cannot be opened or the model does not compile.
         """
-        self._inbox: queue.SimpleQueue[Delivery | Callable[[], Any]] = queue.SimpleQueue()
+        self._inbox: queue.SimpleQueue[SourceBatch | Callable[[], Any]] = queue.SimpleQueue()
         self._submitted: deque[Callable[[], Any]] = deque()
         """Commands and reloads that wait in the inbox; a fold is left unfinished for them."""
         self._workshop = workshop or Workshop()
@@ -350,7 +350,7 @@ class Engine(Running):
         batches: list[Events] = []
         mark = self._mark
         while item is not None:
-            if isinstance(item, Delivery):
+            if isinstance(item, SourceBatch):
                 batches.append(item.events)
                 mark = item.mark
                 if self._feeder.waits:

@@ -25,7 +25,7 @@ MAX_BATCHES_AHEAD = 32
 """Batches that may wait for the engine. A replay waits then; a bus is never held up."""
 
 
-class Delivery(NamedTuple):
+class SourceBatch(NamedTuple):
     """Events of a source, and its `mark` after them; 0 of a source that does not count what it has read."""
 
     events: Events
@@ -96,7 +96,7 @@ class Feeder:
         if len(batch) or mark != self._mark:
             if self.waits:
                 self._room.acquire()
-            self._inbox.put(Delivery(batch, mark))
+            self._inbox.put(SourceBatch(batch, mark))
         self._mark = mark
         return len(batch)
 

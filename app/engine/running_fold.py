@@ -146,7 +146,7 @@ class Running(ABC):
         self._revision = 0
         self._logs = 0
         self._taken = self._mark = 0
-        """Events that the source gave since it began, and its mark after them; see `feeder.Delivery`."""
+        """Events that the source gave since it began, and its mark after them; see `SourceBatch`."""
         self._intake_state: Mapping[str, Any] = {}
         if stored is not None:
             self.estimator, self.tuning = stored.tail.estimator, stored.tail.tuning

@@ -12,7 +12,7 @@ import rerun.blueprint as rrb
 from estimators.model.state_space import StateSpaceModel
 from estimators.numerics.quantiles import chi_square_quantile
 
-from ..charts.colors import EITHER, RGB, Frame, Palette, kinds
+from ..charts.colors import EITHER, RGB, Palette, PictureFrame, kinds
 from ..charts.direct_readings import measured_by
 from .sink import NOTICES_PATH, SCALE_GAP, TIMELINE, band_color, pair_name, row_title, with_unit
 
@@ -177,7 +177,7 @@ def field_pictures(model: StateSpaceModel, root: str, *, truth: bool) -> rrb.Hor
     """Estimate, deviation, and error with the truth behind it in a tab."""
     grid = model.grid
     assert grid is not None
-    frame = Frame.of(grid)
+    frame = PictureFrame.of(grid)
     bounds = rrb.VisualBounds2D(
         x_range=(-0.04 * frame.width, (1.2 + 2 * SCALE_GAP) * frame.width),
         y_range=(-0.06 * frame.height, 1.06 * frame.height),

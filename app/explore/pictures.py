@@ -14,8 +14,8 @@ from estimators.track import Track
 from ..charts.colors import (
     EITHER,
     RIM,
-    Frame,
     Palette,
+    PictureFrame,
     Scale,
     gradient,
     image_of,
@@ -34,7 +34,7 @@ class FieldDrawing:
         self._theme = theme
         assert model.grid is not None
         self._model = model
-        self._frame = Frame.of(model.grid)
+        self._frame = PictureFrame.of(model.grid)
         self._bar = max(3, round(SCALE_GAP * self._frame.width))
         self._kinds = kinds(truth)
         self._palettes = {kind.name: gradient(kind.colors) for kind in self._kinds}

@@ -33,7 +33,7 @@ SQUARE_ROOT = ("sr-ekf", "sr-kf", "sr-ukf")  # Filters whose factor with conside
 
 
 @dataclass(frozen=True)
-class Recorded:
+class ReadRecording:
     """Content of a recording.
 
     `text` is the twin's YAML, `version` its tuning version, `overrides` the keys that the command line changed (older
@@ -76,7 +76,7 @@ class Recorded:
         return base._replace(estimator="", state=None, evidence=None, doubt=None), remark
 
 
-def read_recording(path: Path) -> Recorded:
+def read_recording(path: Path) -> ReadRecording:
     """Read a recording, also one whose writer was killed.
 
     Raises:
@@ -113,7 +113,7 @@ def read_recording(path: Path) -> Recorded:
     start = content.bases[-1][0] if content.bases else first
     # Events before the base belong to an earlier fold of the session.
     events = Events(*(_column(name, columns) for name in Events._fields)).select(slice(max(0, start - first), None))
-    return Recorded(
+    return ReadRecording(
         path=path,
         name=str(header["name"]),
         text=str(header["yaml"]),

@@ -14,8 +14,8 @@ from ..charts.colors import (
     DEVIATION,
     ESTIMATE,
     RIM,
-    Frame,
     Palette,
+    PictureFrame,
     Scale,
     gradient,
     image_of,
@@ -44,7 +44,7 @@ class FieldView:
     def __init__(self, api: viser.SceneApi, model: StateSpaceModel, theme: Palette, name: str, *, truth: bool) -> None:
         assert model.grid is not None
         self._unit, self._name = model.grid.unit, name
-        self._frame = Frame.of(model.grid)
+        self._frame = PictureFrame.of(model.grid)
         self._kinds = {kind.title: kind for kind in kinds(truth)}
         self._kind = ESTIMATE
         self._scales = {kind.name: Scale(kind) for kind in self._kinds.values()}

@@ -14,7 +14,7 @@ from config.source_schema import CanLogSection, CanSection, MergedSection
 from estimators.diagnostics.calibration import BANDS, Calibration
 from estimators.diagnostics.detectors import is_outside
 from estimators.diagnostics.episodes import Episode, episode_json, episodes
-from estimators.diagnostics.repeats import Finding
+from estimators.diagnostics.repeats import RepeatFinding
 from estimators.diagnostics.score import health_of
 from estimators.diagnostics.sensitivity import Gramian, GramianView, Sensitivity, bounds_of, sensitivities, worse_faults
 from estimators.diagnostics.sensitivity.checklist import Arrivals, Dimension, Linearity, arrivals, dimension
@@ -84,7 +84,7 @@ class Checked:
     episodes: list[Episode]
     held_out: HeldOut
     jumps: str
-    repeats: dict[str, Finding]
+    repeats: dict[str, RepeatFinding]
 
     @property
     def health(self) -> dict[str, float]:

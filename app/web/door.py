@@ -245,7 +245,7 @@ class Door:
             server_header=False, lifespan="off", ws_per_message_deflate=False, timeout_graceful_shutdown=1,
             http=BoundedProtocol, backlog=BACKLOG,
         )  # fmt: skip
-        self._server = PageServer(config)
+        self._server = UvicornServer(config)
         self._thread = LoopThread(functools.partial(self._server.run, sockets=self.sockets), "page server")
 
     @property
@@ -360,7 +360,7 @@ async def _alive(request: Request) -> PlainTextResponse:
     return PlainTextResponse("ok\n")
 
 
-class PageServer(uvicorn.Server):
+class UvicornServer(uvicorn.Server):
     """uvicorn's server, which looks once a second whether it is to end, not ten times."""
 
     _end: Callable[[], object] = staticmethod(lambda: None)

@@ -37,7 +37,7 @@ STORE_TIMEOUT_S, OUTCOME_TIMEOUT_S, POLL_S = 2.0, 0.5, 0.005
 """Longest wait for the store, and for the outcomes, and the time between two looks at them."""
 
 
-class Receiver(Protocol):
+class Recipient(Protocol):
     """A running twin or fleet, whose source may take messages."""
 
     @property
@@ -57,7 +57,7 @@ class Receiver(Protocol):
         """What became of its messages."""
 
 
-def routes(engine: Receiver) -> list[BaseRoute]:
+def routes(engine: Recipient) -> list[BaseRoute]:
     """Return the routes of a running twin or fleet."""
 
     def names() -> dict[str, Any]:
@@ -91,7 +91,7 @@ def routes(engine: Receiver) -> list[BaseRoute]:
     return [get("/api/readings", names, refused=409), Route("/api/readings", send, methods=["POST"])]
 
 
-def messages_of(engine: Receiver) -> Messages:
+def messages_of(engine: Recipient) -> Messages:
     """Return the source of messages of a running twin or fleet.
 
     Raises:
@@ -104,7 +104,7 @@ def messages_of(engine: Receiver) -> Messages:
     return source
 
 
-async def send_to(engine: Receiver, messages: Sequence[Any]) -> dict[str, Any]:
+async def send_to(engine: Recipient, messages: Sequence[Any]) -> dict[str, Any]:
     """Send messages; return what became of each, the counts, and whether the store has them."""
     source = messages_of(engine)
     answers = await in_thread(lambda: source.send(messages))
@@ -128,7 +128,7 @@ def summary(answers: Sequence[Answer], became: Mapping[int, str] = MappingProxyT
     return counts | {"items": items}
 
 
-async def outcomes(engine: Receiver, mark: int, answers: Sequence[Answer]) -> dict[int, str]:
+async def outcomes(engine: Recipient, mark: int, answers: Sequence[Answer]) -> dict[int, str]:
     """Wait until messages up to a mark have been taken; return what became of each by its arrival, none if too long."""
     arrivals = np.array([item.arrival for item in answers if item.status == ACCEPTED], np.int64)
     end = time.monotonic() + OUTCOME_TIMEOUT_S
@@ -140,7 +140,7 @@ async def outcomes(engine: Receiver, mark: int, answers: Sequence[Answer]) -> di
     return {}
 
 
-async def stored(engine: Receiver, mark: int) -> bool:
+async def stored(engine: Recipient, mark: int) -> bool:
     """Wait until the store has the messages up to a mark; return whether it does, at once without a store."""
     store, end = engine.store, time.monotonic() + STORE_TIMEOUT_S
     while store is not None and (found := store.has(mark)) is not None:

@@ -43,7 +43,7 @@ MIN_Z, MIN_HELD, MAX_BETWEEN = 7.0, 0.98, 0.9
 MAX_APART, MAX_RANKED = 100, 30_000  # Rows between such knots, and rows in which they are searched
 
 
-class Finding(NamedTuple):
+class RepeatFinding(NamedTuple):
     """Whether the rows of a channel are measurements of their own.
 
     `kind` is HELD (a new value each `period`), STEPS or DEAD_BAND (constant between changes without a period), LINEAR
@@ -75,14 +75,14 @@ RECENT = (200, 800, 3200, 12_800, 51_200)
 """Latest values that are searched: a hold is found once it has `MIN_CHANGES` new values in one of these."""
 
 
-def latest_repeats(t: np.ndarray, values: np.ndarray) -> tuple[int, Finding]:
+def latest_repeats(t: np.ndarray, values: np.ndarray) -> tuple[int, RepeatFinding]:
     """Return the first time (ns) of the latest values of a channel, and whether these are repeats, as `find_repeats`.
 
     They are HELD if any number of them in `RECENT` is, and undecided only if all are.
     """
     found = [(int(t[-n:][0]), find_repeats(t[-n:], values[-n:])) for n in RECENT if n < 4 * t.size]
     order = [HELD, SINGLE, STEPS, DEAD_BAND, LINEAR, UNDECIDED]
-    return min(found, key=lambda item: order.index(item[1].kind), default=(0, Finding(UNDECIDED)))
+    return min(found, key=lambda item: order.index(item[1].kind), default=(0, RepeatFinding(UNDECIDED)))
 
 
 def sensor_rows(model: StateSpaceModel, events: Events) -> Iterator[tuple[str, str, int, np.ndarray]]:
@@ -93,7 +93,7 @@ def sensor_rows(model: StateSpaceModel, events: Events) -> Iterator[tuple[str, s
             yield sensor.name, row.name, column, own & np.isfinite(events.value[:, column])
 
 
-def find_repeats(t: np.ndarray, values: np.ndarray) -> Finding:
+def find_repeats(t: np.ndarray, values: np.ndarray) -> RepeatFinding:
     """Decide whether rows repeat or interpolate.
 
     Args:
@@ -105,7 +105,7 @@ def find_repeats(t: np.ndarray, values: np.ndarray) -> Finding:
     apart = np.diff(t)
     changes = np.flatnonzero(d)
     if changes.size < MIN_CHANGES or not apart.any():
-        return Finding(UNDECIDED, reason=f"fewer than {MIN_CHANGES} changes")
+        return RepeatFinding(UNDECIDED, reason=f"fewer than {MIN_CHANGES} changes")
     # Rows in usual intervals, so that gaps and lost rows do not move the phase, nor do late rows.
     place = np.append(0, np.cumsum(np.maximum(np.rint(apart / np.median(apart[apart > 0])), 1.0))).astype(np.int64)
     step = _grid(values, d)
@@ -117,15 +117,15 @@ def find_repeats(t: np.ndarray, values: np.ndarray) -> Finding:
         if repeated or not _has_pattern(d):
             share = float(np.mean(d == 0.0))
             text = f"new value every {known[0]:.4g} s, repeated in {100.0 * share:.0f} % of rows"
-            return Finding(HELD, *known, share, text)
+            return RepeatFinding(HELD, *known, share, text)
     if repeated:
         return _steps(values, d, step)
     line = _line(t, values, d, place, step)
     # A hold is possible if few changes are in neighbouring rows.
     held = changes.size < MIN_CHANGES or np.mean(np.diff(place[changes]) == 1) <= 1.0 - MIN_PERIODIC
     if line is None and repeated is None and held:
-        return Finding(UNDECIDED, reason="its values are too coarse")
-    return line or Finding(SINGLE)
+        return RepeatFinding(UNDECIDED, reason="its values are too coarse")
+    return line or RepeatFinding(SINGLE)
 
 
 def _grid(values: np.ndarray, d: np.ndarray) -> float:
@@ -224,10 +224,10 @@ def _multiples(runs: np.ndarray, period: float) -> tuple[np.ndarray, np.ndarray]
     return np.abs(runs - multiple * period), multiple
 
 
-def _steps(values: np.ndarray, d: np.ndarray, step: float) -> Finding:
+def _steps(values: np.ndarray, d: np.ndarray, step: float) -> RepeatFinding:
     """Return the finding for values that are held without a period."""
     if np.unique(values).size <= MAX_LEVELS:
-        return Finding(UNDECIDED, reason=f"{MAX_LEVELS} different values or fewer")
+        return RepeatFinding(UNDECIDED, reason=f"{MAX_LEVELS} different values or fewer")
     share, size = float(np.mean(d == 0.0)), np.abs(d[d != 0.0])
     words = f"repeated in {100.0 * share:.0f} % of rows, without a period"
     for q in (0.25, 0.5, 0.75, 1.0):
@@ -235,11 +235,11 @@ def _steps(values: np.ndarray, d: np.ndarray, step: float) -> Finding:
         wide = size[size < np.quantile(size, q)]
         small = 0.5 * float(wide.max(initial=0.0))
         if small >= MIN_SIZE * step and 4.0 * bdtr(int(np.sum(wide < small)), wide.size, 0.5) < MAX_P:
-            return Finding(DEAD_BAND, np.nan, np.nan, share, f"small changes are left out (dead band), {words}")
-    return Finding(STEPS, np.nan, np.nan, share, f"held or set point, {words}")
+            return RepeatFinding(DEAD_BAND, np.nan, np.nan, share, f"small changes are left out (dead band), {words}")
+    return RepeatFinding(STEPS, np.nan, np.nan, share, f"held or set point, {words}")
 
 
-def _line(t: np.ndarray, values: np.ndarray, d: np.ndarray, place: np.ndarray, step: float) -> Finding | None:
+def _line(t: np.ndarray, values: np.ndarray, d: np.ndarray, place: np.ndarray, step: float) -> RepeatFinding | None:
     """Return the finding for rows on straight lines between knots; None if they are not."""
     h = np.maximum(np.diff(t).astype(float), 1.0)
     chord = (values[:-2] * h[1:] + values[2:] * h[:-1]) / (h[1:] + h[:-1])
@@ -263,7 +263,7 @@ def _line(t: np.ndarray, values: np.ndarray, d: np.ndarray, place: np.ndarray, s
     share = float(np.mean(e <= tolerance))
     words = f"interpolated or computed in {100.0 * share:.0f} % of rows"
     each = f", straight between values every {known[0]:.4g} s" if np.isfinite(known[0]) else ""
-    return Finding(LINEAR, *known, share, words + each)
+    return RepeatFinding(LINEAR, *known, share, words + each)
 
 
 def _knots_apart(values: np.ndarray, d: np.ndarray, e: np.ndarray, tolerance: float) -> int:

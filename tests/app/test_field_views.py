@@ -13,7 +13,7 @@ from app.charts.colors import (
     NORMAL_DOT,
     UNKNOWN_DOT,
     UNKNOWN_INDEX,
-    Frame,
+    PictureFrame,
     Scale,
     sensor_colors,
 )
@@ -242,7 +242,7 @@ def test_a_recording_reviews_to_the_same_pictures(running, twin, batches, tmp_pa
         == [seconds(picture) for picture in told]
         == [5, 10, 15, 20]
     )
-    frame = Frame.of(twin.model.grid)
+    frame = PictureFrame.of(twin.model.grid)
     picture = np.frombuffer(bytes_of(rows[-1][1]), np.uint8).reshape(frame.height, frame.width)
     index = picture[frame.tall // 2 :: frame.tall, frame.wide // 2 :: frame.wide].astype(int)
     mean = seen.pictures[-1].mean
@@ -280,7 +280,7 @@ def test_the_scene_shows_the_picture_that_is_chosen_and_the_sensor_that_is_off(r
         view.frame()
         scene, pull = view.stage.scene, live.pull()
         assert scene._title.text == "temperature: estimate [°C]"
-        frame = Frame.of(live.engine.model.grid)
+        frame = PictureFrame.of(live.engine.model.grid)
         first = scene._image.image.copy()
         assert first.shape == (frame.height, frame.width, 3)
         # Hottest where the estimate is hottest.
@@ -356,12 +356,12 @@ def test_a_scale_has_round_numbers_and_moves_seldom():
 
 def test_a_frame_keeps_distances_in_shape():
     """Cells of 27.8 km by 16.3 km; places in the middle of their cells."""
-    frame = Frame.of(Field("t", "K", (33, 49), spacing=(27.8, 16.3)))
+    frame = PictureFrame.of(Field("t", "K", (33, 49), spacing=(27.8, 16.3)))
     assert frame.tall / frame.wide == pytest.approx(27.8 / 16.3, rel=0.05)
     np.testing.assert_allclose(
         frame.pixels(np.array([[27.8, 16.3 * 48]])), [[48.5 * frame.wide, 1.5 * frame.tall]], rtol=1e-12
     )
-    large = Frame.of(Field("t", "K", (1000, 1000), spacing=0.01))
+    large = PictureFrame.of(Field("t", "K", (1000, 1000), spacing=0.01))
     assert (large.rows, large.columns, large.reduced) == (200, 200, 5)
     np.testing.assert_allclose(large.pixels(np.array([[9.99, 0.0]])) / large.wide, [[0.1, 199.9]])
 

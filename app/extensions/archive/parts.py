@@ -57,7 +57,7 @@ def remove_surplus(folder: Path, split: Split, report: Report) -> None:
             report("kept archive", f"{path}: it cannot be removed ({error.strerror})")
 
 
-class Part:
+class ParquetPart:
     """File that is being written."""
 
     def __init__(self, folder: Path, number: int | None = None) -> None:

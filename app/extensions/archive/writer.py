@@ -21,7 +21,7 @@ from estimators.events.batch import MAINTENANCE
 from estimators.interface.table import table_of
 from sources.worker_process import gist
 
-from .parts import DAY_NS, GROUP_ROWS, ArchivePlan, Part, parts_of, remove_surplus
+from .parts import DAY_NS, GROUP_ROWS, ArchivePlan, ParquetPart, parts_of, remove_surplus
 
 if TYPE_CHECKING:
     from pathlib import Path
@@ -45,7 +45,7 @@ class Archive:
         self._cursor = engine.cursor(follows_log=True)
         self._next, self._versions = 0, _Versions()
         self._begin = 0 if stored is None else stored.tail.first
-        self._part: Part | None = None
+        self._part: ParquetPart | None = None
         self._failed = False
         self._grown = threading.Event()
         self._stored = stored
@@ -115,7 +115,7 @@ class Archive:
         if end == cursor.next and self._part is None:
             return
         if self._part is None:
-            self._part = Part(self._folder)
+            self._part = ParquetPart(self._folder)
             self._remove_surplus()
         due = closing or time.monotonic() - self._part.begun >= self._split.seconds
         if not due and 0 <= end - cursor.next < min(GROUP_ROWS, engine.history // 4):
@@ -149,7 +149,7 @@ class Archive:
             if self._part is not None and self._part.writer is not None and self._part.writer.schema != table.schema:
                 self._finish()
             if self._part is None:
-                self._part = Part(self._folder)
+                self._part = ParquetPart(self._folder)
             self._part.write(table, pull.first + start, int(events.t[start]), day)
             if self._part.size >= self._split.size:
                 self._finish()

@@ -9,7 +9,7 @@ from contextlib import suppress
 from pathlib import Path
 from typing import Any
 
-from app.extensions.archive.parts import DAY_NS, Part, lock, number_of, parts_of
+from app.extensions.archive.parts import DAY_NS, ParquetPart, lock, number_of, parts_of
 from estimators.errors import SourceError
 
 JOURNAL = ".arrows"
@@ -111,7 +111,7 @@ def complete_journal(path: Path, stored: Mapping[str, Any] | None = None) -> Non
         complete = number in map(number_of, parts_of(folder))  # the process ended before the journal's end
         if table is not None and not complete:
             table, t = table.replace_schema_metadata(), int(table["t_ns"][0].as_py())
-            part = Part(folder, number)
+            part = ParquetPart(folder, number)
             try:
                 order = pc.sort_indices(table, sort_keys=[("asset", "ascending")])  # stable
                 part.write(table.take(order), 0, t, t // DAY_NS)

@@ -34,9 +34,9 @@ NS = {"s": 10**9, "ms": 10**6, "us": 1000, "ns": 1}
 
 def push(arguments: Arguments) -> int:
     """Run the command: 0 if no line was refused, else 1."""
-    twin = Twin(arguments.url or os.environ.get("NISUS_URL", ""))
+    twin = TwinClient(arguments.url or os.environ.get("NISUS_URL", ""))
     names = {item["name"] for item in twin.ask()["values"]}
-    rows = Rows(sys.stdin, names, arguments.time, NS[arguments.unit], arguments.source or uuid.uuid4().hex)
+    rows = RowReader(sys.stdin, names, arguments.time, NS[arguments.unit], arguments.source or uuid.uuid4().hex)
     counts: Counter[str] = Counter(accepted=0, duplicate=0, refused=0)
     shown = 0
     try:
@@ -55,7 +55,7 @@ def push(arguments: Arguments) -> int:
     return int(counts["refused"] > 0)
 
 
-class Rows:
+class RowReader:
     """Lines of a stream as messages: NDJSON, or CSV whose first line has the names of its columns."""
 
     def __init__(self, stream: Any, names: set[str], time_column: str | None, ns: int, source: str) -> None:
@@ -139,7 +139,7 @@ def _time(cell: str, ns: int) -> int | str:
         return cell.strip()
 
 
-class Twin:
+class TwinClient:
     """The address of a running twin, with its token."""
 
     def __init__(self, url: str) -> None:

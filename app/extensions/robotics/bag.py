@@ -22,7 +22,7 @@ from sources.tables.rows import TableFormat
 from sources.tables.text import CHUNK_ROWS, UNREADABLE, Chunk, Column, Problem, column_of
 from sources.worker_process import gist
 
-from .message_fields import Declared, Field, Topic, topics_of
+from .message_fields import BagTopic, Declared, MessageField, topics_of
 
 ENDINGS = (".mcap", ".db3")  # Of the files of a bag
 
@@ -80,7 +80,7 @@ def bag_names(path: Path, time: str = "") -> list[str]:
     return found
 
 
-def _first(topics: dict[str, Topic], wanted: set[str], messages: Messages) -> Iterator[tuple[str, Any]]:
+def _first(topics: dict[str, BagTopic], wanted: set[str], messages: Messages) -> Iterator[tuple[str, Any]]:
     """Yield topic and message of the first messages of some topics, as far as they can be read."""
     left = dict.fromkeys(wanted, MAX_SCANNED)
     with suppress(Exception):  # Reading it reports where it is damaged.
@@ -119,7 +119,7 @@ def read_bag(path: Path, time: str, columns: Sequence[Column], problem: Problem)
         )
     with _bag(path) as (declared, messages):
         topics = topics_of(path, declared)
-        picks: dict[str, list[tuple[int, Field, str]]] = {}
+        picks: dict[str, list[tuple[int, MessageField, str]]] = {}
         for k, column in enumerate(columns):
             if not isinstance(column, str):
                 text = f"{column.column} holds numbers, not text; give a number"
@@ -161,7 +161,7 @@ def read_bag(path: Path, time: str, columns: Sequence[Column], problem: Problem)
 BAG = TableFormat(bag_names, read_bag, sparse=True)
 
 
-def _time(topic: Topic, message: Any, logged: int) -> int:
+def _time(topic: BagTopic, message: Any, logged: int) -> int:
     if topic.stamped:
         stamp = message.header.stamp
         t = int(stamp.sec) * 10**9 + int(stamp.nanosec)

@@ -33,7 +33,7 @@ NO_VALUES = (HEADER, "std_msgs/msg/MultiArrayLayout")  # Types whose numbers are
 Test = Callable[[Any], bool]
 
 
-class Field(NamedTuple):
+class MessageField(NamedTuple):
     """Numeric field of a message.
 
     `get` returns its value, or its array; `names` the names of the elements, or None where they have numbers. The value
@@ -64,12 +64,12 @@ class Field(NamedTuple):
         return math.nan if any(test(message) for test in self.invalid) else float(found)
 
 
-class Topic(NamedTuple):
+class BagTopic(NamedTuple):
     """Topic of a bag: the type of its messages, their decoder, their fields, and whether they have a header."""
 
     type: str
     decode: Callable[[bytes], Any]
-    fields: dict[str, Field]
+    fields: dict[str, MessageField]
     stamped: bool
 
 
@@ -82,7 +82,7 @@ class Declared(NamedTuple):
     text: str
 
 
-def topics_of(path: Path, declared: dict[str, Declared]) -> dict[str, Topic]:
+def topics_of(path: Path, declared: dict[str, Declared]) -> dict[str, BagTopic]:
     """Return the topics whose messages can be decoded and have numbers, in the order of their names.
 
     Raises:
@@ -107,7 +107,7 @@ def topics_of(path: Path, declared: dict[str, Declared]) -> dict[str, Topic]:
             reasons.append(f"{name}: {gist(error)}")
             continue
         if fields:
-            found[name] = Topic(one.type, _decoder(store, one.type), fields, stamped)
+            found[name] = BagTopic(one.type, _decoder(store, one.type), fields, stamped)
     if not found:
         why = "; ".join(reasons[:3]) or ("its messages hold no numbers" if declared else "it holds no messages")
         raise SourceError(f"{path}: has no columns; {why}")
@@ -139,11 +139,11 @@ def _stamped(types: Any, kind: str) -> bool:
     return any(name == "header" and form[1] == HEADER for name, form in types[kind][1])
 
 
-def _fields(types: Any, kind: str, prefix: str = "", invalid: tuple[Test, ...] = ()) -> dict[str, Field]:
+def _fields(types: Any, kind: str, prefix: str = "", invalid: tuple[Test, ...] = ()) -> dict[str, MessageField]:
     """Return the numeric fields of a type by their path."""
     from rosbags.interfaces import Nodetype
 
-    found: dict[str, Field] = {}
+    found: dict[str, MessageField] = {}
     members, texts = dict(types[kind][1]), ((Nodetype.BASE, ("string", 0)), 0)
     fix = kind == "sensor_msgs/msg/NavSatFix"
     named = next((name for name in ("name", "names") if members.get(name) == (Nodetype.SEQUENCE, texts)), None)
@@ -157,10 +157,10 @@ def _fields(types: Any, kind: str, prefix: str = "", invalid: tuple[Test, ...] =
         if node == Nodetype.NAME and form not in NO_VALUES:
             found |= _fields(types, form, f"{path}.", tests)
             if form == "geometry_msgs/msg/Quaternion":
-                found |= {f"{path}.{axis}": Field(_part(path, angle, axis), tests) for axis in AXES[3:]}
+                found |= {f"{path}.{axis}": MessageField(_part(path, angle, axis), tests) for axis in AXES[3:]}
         elif node == Nodetype.BASE and form[0] not in ("string", "wstring"):
             if name != "structure_needs_at_least_one_member":
-                found[path] = Field(attrgetter(path), tests)
+                found[path] = MessageField(attrgetter(path), tests)
         elif node in (Nodetype.ARRAY, Nodetype.SEQUENCE) and form[0][0] == Nodetype.BASE:
             base, length = form[0][1][0], form[1]
             fixed = node == Nodetype.ARRAY
@@ -172,9 +172,9 @@ def _fields(types: Any, kind: str, prefix: str = "", invalid: tuple[Test, ...] =
                     tests = (*tests, _test(f"{path}_type", lambda known: known == 0))
                 size = math.isqrt(length)
                 for k in range(size):
-                    found[f"{path}.{AXES[k]}"] = Field(_part(path, getitem, k * (size + 1)), tests)
+                    found[f"{path}.{AXES[k]}"] = MessageField(_part(path, getitem, k * (size + 1)), tests)
             else:
-                found[path] = Field(attrgetter(path), tests, array=True, names=None if fixed else names)
+                found[path] = MessageField(attrgetter(path), tests, array=True, names=None if fixed else names)
     return found
 
 

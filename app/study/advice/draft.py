@@ -16,7 +16,7 @@ import numpy as np
 
 from config.loader import shipped
 from config.yaml_files import writing
-from estimators.diagnostics.repeats import SINGLE, UNDECIDED, Finding
+from estimators.diagnostics.repeats import SINGLE, UNDECIDED, RepeatFinding
 from estimators.errors import ConfigError
 from sources.can.readers import BusName
 from sources.inspect import RecordingContents
@@ -375,7 +375,7 @@ def _source(
             if not family or family.first == reads.name
         ]
         inputs = [
-            _channel(each, one._replace(repeats=Finding(SINGLE))) for each, one in drafted.inputs if one.part == k
+            _channel(each, one._replace(repeats=RepeatFinding(SINGLE))) for each, one in drafted.inputs if one.part == k
         ]
         if channels:
             lines += ["sensors:", *channels]
@@ -501,7 +501,7 @@ def hint_lines(drafted: DraftPlan) -> list[str]:
     return lines
 
 
-def undecided_lines(found: Iterable[tuple[str, Finding]]) -> list[str]:
+def undecided_lines(found: Iterable[tuple[str, RepeatFinding]]) -> list[str]:
     """Return of which signals it cannot be decided whether they repeat values, by the reason, a line each."""
     reasons: dict[str, list[str]] = {}
     for name, one in found:

@@ -42,7 +42,7 @@ def with_options(tuning: Tuning, options: Mapping[str, str | float]) -> Tuning:
     return tuning.with_options({key: complete[key] for key in options})
 
 
-class Split(NamedTuple):
+class Turns(NamedTuple):
     """Parts of a recording between times `edges`, ns, in turn fitted and checked; the first is fitted."""
 
     edges: tuple[int, ...]
@@ -61,10 +61,10 @@ class Split(NamedTuple):
 ALTERNATE_PARTS = 8  # Parts of a recording whose halves differ
 
 
-def split_of(drafted: DraftPlan, parts: int = 2) -> Split:
+def split_of(drafted: DraftPlan, parts: int = 2) -> Turns:
     """Return an even number of parts with as many readings of the sensors each."""
     times = np.concatenate([reads.signal.series.t for reads in drafted.sensors])
-    return Split(tuple(int(np.quantile(times, k / parts)) for k in range(1, parts)))
+    return Turns(tuple(int(np.quantile(times, k / parts)) for k in range(1, parts)))
 
 
 def log_of(
@@ -116,7 +116,7 @@ class ModelFiles:
 class DraftFold:
     """Fold of a whole draft, as its YAML has it, over its recording, or over the first half alone."""
 
-    def __init__(self, drafted: DraftPlan, model: StateSpaceModel, split: Split, *, fitted_only: bool = False) -> None:
+    def __init__(self, drafted: DraftPlan, model: StateSpaceModel, split: Turns, *, fitted_only: bool = False) -> None:
         self.drafted, self.model = drafted, model
         self._sensors = drafted.sensors
         zero = min(int(reads.signal.series.t[0]) for reads in self._sensors)

@@ -25,7 +25,7 @@ from estimators.model.coloured import ColouredError, coloured, disturbance_time,
 from estimators.model.state_space import StateSpaceModel
 from estimators.tuning import Tuning
 
-from .draft_check import ALTERNATE_PARTS, HALVES_DIFFER, DraftFold, ModelFiles, Split, log_of, split_of, with_options
+from .draft_check import ALTERNATE_PARTS, HALVES_DIFFER, DraftFold, ModelFiles, Turns, log_of, split_of, with_options
 from .plan import DraftPlan, Moves, Reads, reads_of
 from .relations import pairs
 from .signals import MIN_VALUES, Signal, noise_of
@@ -68,7 +68,7 @@ class FittedStructure(NamedTuple):
     item: Moves
 
 
-def windows_of(item: Moves, split: Split) -> list[tuple[int, int]]:
+def windows_of(item: Moves, split: Turns) -> list[tuple[int, int]]:
     """Return windows of the fitted parts with at most `MAX_FIT_READINGS` readings together."""
     t = np.sort(np.concatenate([reads.signal.series.t for reads in item.sensors]))
     ends = [*split.edges, int(t[-1]) + 1]
@@ -91,7 +91,7 @@ def windows_of(item: Moves, split: Split) -> list[tuple[int, int]]:
 def fitted(
     item: Moves,
     inputs: Sequence[tuple[str, Signal]],
-    split: Split,
+    split: Turns,
     span: float,
     files: ModelFiles,
     progress: FitProgress,
@@ -146,7 +146,7 @@ def _fit(
     options: Options,
     *,
     inputs: Sequence[tuple[str, Signal]],
-    split: Split,
+    split: Turns,
     span: float,
     progress: FitProgress,
 ) -> FittedStructure | None:
@@ -243,7 +243,7 @@ def fit_plan(drafted: DraftPlan, progress: FitProgress | None = None) -> Generat
     return found
 
 
-def _fit_split(drafted: DraftPlan, split: Split, progress: FitProgress) -> Generator[DraftStep, None, DraftPlan]:
+def _fit_split(drafted: DraftPlan, split: Turns, progress: FitProgress) -> Generator[DraftStep, None, DraftPlan]:
     """Yield the steps of fitting a draft to some parts of its recording; return the plan, checked on the others."""
     t = np.concatenate([reads.signal.series.t for reads in drafted.sensors])
     span = float(t.max() - t.min()) * 1e-9
@@ -280,7 +280,7 @@ def _fit_split(drafted: DraftPlan, split: Split, progress: FitProgress) -> Gener
             fitted_plan = replace(fitted_plan, check=DraftFold(fitted_plan, best.model, split).check(span))
             if fitted_plan.check is not None and min(early) < MIN_FITTED and not progress.stop:
                 yield DraftStep("fitting all of the short recording")
-                whole = Split((int(t.max()) + 1,))
+                whole = Turns((int(t.max()) + 1,))
                 again = [_again(item, fitted_plan, whole, span, files, progress) for item in fitted_plan.states]
                 check = fitted_plan.check._replace(refitted=True)
                 fitted_plan = replace(fitted_plan, states=tuple(again), check=check)
@@ -288,7 +288,7 @@ def _fit_split(drafted: DraftPlan, split: Split, progress: FitProgress) -> Gener
 
 
 def _again(
-    item: Moves, drafted: DraftPlan, split: Split, span: float, files: ModelFiles, progress: FitProgress
+    item: Moves, drafted: DraftPlan, split: Turns, span: float, files: ModelFiles, progress: FitProgress
 ) -> Moves:
     """Return a fitted state with the noises of the same structure fitted to other parts."""
     inputs = [each for each in drafted.inputs if each[0] in item.inputs]
@@ -306,7 +306,7 @@ def _again(
     return item if found is None else found.item
 
 
-def _scaled_on(item: Moves, split: Split) -> Moves:
+def _scaled_on(item: Moves, split: Turns) -> Moves:
     """Return the state with scales and offsets of its other sensors from the fitted parts alone, where these do."""
 
     def early(one: Signal) -> Signal:

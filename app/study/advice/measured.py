@@ -13,7 +13,7 @@ import numpy as np
 
 from estimators.diagnostics.detectors import detector_of
 from estimators.diagnostics.episodes import Episode, episodes
-from estimators.diagnostics.repeats import Finding, find_repeats, sensor_rows
+from estimators.diagnostics.repeats import RepeatFinding, find_repeats, sensor_rows
 from estimators.diagnostics.score import score
 from estimators.diagnostics.sensitivity import Gramian, gramian
 from estimators.diagnostics.sensitivity.checklist import MIN_DIFFERENCE, Linearity, linearity
@@ -78,7 +78,7 @@ def without_faults(twin: Twin, log: Log, known: Sequence[Episode] | None = None)
     return (clean, tuple(sorted(found, key=lambda item: (item.start, item.row)))) if found else (log, ())
 
 
-def repeats_of(model: StateSpaceModel, log: Log) -> dict[str, Finding]:
+def repeats_of(model: StateSpaceModel, log: Log) -> dict[str, RepeatFinding]:
     """Return how the measurements of each sensor row repeat."""
     return {
         row: find_repeats(log.events.t[known], log.events.value[:, column][known])
@@ -87,7 +87,7 @@ def repeats_of(model: StateSpaceModel, log: Log) -> dict[str, Finding]:
     }
 
 
-def repeat_lines(found: Mapping[str, Finding]) -> list[str]:
+def repeat_lines(found: Mapping[str, RepeatFinding]) -> list[str]:
     """Return the sensor rows whose measurements are repeats, with the remedy, a line each."""
     lines = []
     for name, one in found.items():

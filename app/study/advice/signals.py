@@ -10,7 +10,7 @@ from typing import NamedTuple
 import numpy as np
 
 from config.fields import repeat_period
-from estimators.diagnostics.repeats import SINGLE, Finding, find_repeats
+from estimators.diagnostics.repeats import SINGLE, RepeatFinding, find_repeats
 from estimators.errors import LARGEST
 from sources.inspect import RecordingContents, SignalSeries, holes
 from sources.mapping import first_of_hold
@@ -57,7 +57,7 @@ class Signal(NamedTuple):
     unit: str = ""
     valid: str = ""
     part: int = 0
-    repeats: Finding = Finding(SINGLE)
+    repeats: RepeatFinding = RepeatFinding(SINGLE)
 
 
 VALID = re.compile(r"valid$|^valid", re.IGNORECASE)

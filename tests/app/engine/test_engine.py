@@ -17,7 +17,7 @@ from app.engine import commands
 from app.engine.batches import BatchSizer
 from app.engine.engine import Engine
 from app.engine.failure_notices import Alerts
-from app.engine.feeder import Delivery
+from app.engine.feeder import SourceBatch
 from app.engine.jobs import Job
 from app.engine.notices import Notices
 from app.twin.twin import load_twin
@@ -349,7 +349,7 @@ def test_measurements_that_wait_to_be_folded_are_age_and_health():
     assert stepped.status().health in USABLE
     for age, health in ((6.0, DEGRADED), (31.0, STALE)):
         ticks.since = time.monotonic() - age
-        engine._inbox.put(Delivery(readings([11.0], [40.0]), 0))
+        engine._inbox.put(SourceBatch(readings([11.0], [40.0]), 0))
         for status in (stepped.status(), engine.latest()):
             assert status.health == health and status.cause.startswith("the filter is behind: measurements of the last")
     engine.settle()

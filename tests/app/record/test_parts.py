@@ -21,7 +21,7 @@ from app.engine import commands
 from app.engine.engine import Engine
 from app.engine.fold_json import tuning_from_json
 from app.record.format import FORMAT, RecordingFile
-from app.record.reader import Recorded, finished, read_recording
+from app.record.reader import ReadRecording, finished, read_recording
 from app.record.rrd_file import NEVER, Split, parse_split
 from app.record.writer import Recorder, RecordingPart
 from app.web.server import command_from_json
@@ -144,7 +144,7 @@ def test_a_factor_of_an_older_format_is_replaced_by_its_moments(tmp_path, estima
     state = base.state.copy()
     state[: old.size] = old
     for number, left in ((2, base._replace(state=state)), (FORMAT, base)):
-        recorded = Recorded(
+        recorded = ReadRecording(
             tmp_path / "old.rrd", "", "", tmp_path, {}, None, left, "", 1, log.events, [], [], at, 0, True, number
         )
         resumed, remark = recorded.base_for(model)
@@ -155,7 +155,7 @@ def test_a_factor_of_an_older_format_is_replaced_by_its_moments(tmp_path, estima
         # As the filters equal the equations: to 1e-9 of the largest.
         np.testing.assert_allclose(fold.track.mean, whole.track.mean[at:], rtol=0, atol=1e-9 * np.max(VALUES))
         np.testing.assert_allclose(fold.track.std, whole.track.std[at:], rtol=1e-9)
-        assert Recorded.base_for(recorded, MODEL)[0] is left
+        assert ReadRecording.base_for(recorded, MODEL)[0] is left
 
 
 def written(path, entity="/nisus/events"):

@@ -5,7 +5,7 @@ import json
 
 import pytest
 
-from app.extensions.push.command import Rows
+from app.extensions.push.command import RowReader
 from tests.app.web.test_readings_api import BEGIN, message, opened
 from tests.cases import cases
 from tests.support import SECOND
@@ -62,7 +62,7 @@ def test_a_mark_of_the_byte_order_is_no_letter_and_a_line_without_end_is_refused
 
 
 def test_lines_that_come_together_are_sent_together():
-    rows = Rows(io.StringIO("time,a\n" + "".join(f"{k},{k}\n" for k in range(2500))), {"a"}, "time", 1, "here")
+    rows = RowReader(io.StringIO("time,a\n" + "".join(f"{k},{k}\n" for k in range(2500))), {"a"}, "time", 1, "here")
     batches = list(rows.batches())
     assert sum(len(messages) for _, messages in batches) == 2500 and len(batches[0][0]) == 1999
     assert batches[0][1][1] == {"source": "here", "sequence": 3, "values": {"a": 1.0}, "time": 1}
