@@ -39,7 +39,7 @@ KINDS = {"switch": "a switch", "counter": "time, counter or status", "constant":
 
 
 def advise(arguments: Arguments) -> int:
-    """Run the command.
+    """Advise which filter to take for twins or recordings.
 
     Raises:
         ConfigError: If twins and recordings are mixed, or an option does not apply.

@@ -21,7 +21,7 @@ if TYPE_CHECKING:
 
 
 def check_twin(arguments: Arguments) -> int:
-    """Run the command."""
+    """Fold the log of a twin, and print what is consistent and what is not."""
     twin = prepared(arguments)
     log, counts = read_log(twin, arguments.duration)
     with executor_of(arguments.cluster, twin, with_held(twin), arguments.twin, overrides_of(arguments)) as executor:

@@ -23,7 +23,7 @@ ALL = "all"  # name that stands for every bundled twin
 
 
 def compare_twin(arguments: Arguments) -> int:
-    """Run the command."""
+    """Fold the log of a twin with several filters, and print their scores."""
     if arguments.twin != ALL:
         rows = _compare(arguments, arguments.twin)
         if arguments.json:

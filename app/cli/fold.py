@@ -30,7 +30,7 @@ if TYPE_CHECKING:
 
 
 def fold_twin(arguments: Arguments) -> int:
-    """Run the command."""
+    """Fold the log of a twin, and print or write the result."""
     twin = opened(arguments)
     out = arguments.out
     write: Callable[..., None] | None = None

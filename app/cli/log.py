@@ -53,7 +53,7 @@ TIMES = (
 
 
 def show_log(arguments: Arguments) -> int:
-    """Run the command."""
+    """Print what a recording holds."""
     found = look(arguments.files, arguments)
     if arguments.json:
         print(to_json(_as_dict(found)))

@@ -123,7 +123,7 @@ def open_review(path: Path, page: Page | None, recordings: Path = Path()) -> tup
 
 
 def review_recording(arguments: ReviewCommand) -> int:
-    """Run the command."""
+    """Show a recording on a page, until Ctrl-C."""
     page = page_of(arguments)
     session, _ = open_review(arguments.file, page, arguments.recordings)
     session.run(record=None, duration=arguments.duration, until_finished=False)

@@ -42,7 +42,7 @@ MIN_BLOCKS = 3  # least number of blocks, of which one is held out
 
 
 def tune_twin(arguments: Arguments) -> int:
-    """Run the command."""
+    """Fit entries of the tuning, and print the verdict."""
     wanted = names_of(arguments.fit)
     if not wanted:
         raise ConfigError("--fit names nothing; write for example --fit Q,R")

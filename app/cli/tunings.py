@@ -40,7 +40,7 @@ SCORE_TITLES = {NIS: "NIS / dof", LIKELIHOOD: "log L per measurement", REFUSED: 
 
 
 def tunings_of(arguments: Arguments) -> int:
-    """Run the command."""
+    """List the tuning versions of a twin, or change one."""
     if sum(name is not None for name in (arguments.save, arguments.accept, arguments.apply)) > 1:
         raise ConfigError("--save, --accept and --apply: give one; a version is judged before it is accepted")
     if len(arguments.names) not in (0, 2):

@@ -14,7 +14,7 @@ if TYPE_CHECKING:
 
 
 def show_twins(arguments: Arguments) -> int:
-    """Run the command. The list needs titles only, without the schema of a twin, which takes longer than all else."""
+    """List the bundled twins, by their titles alone, as a schema takes longer than all else; or describe one."""
     if not (arguments.name or arguments.picture or arguments.json):
         for name in shipped():
             path = TWINS / f"{name}.yaml"

@@ -23,7 +23,7 @@ MAX_COLUMNS = 4  # states in a table; --state names others
 
 
 def explain_change(arguments: Arguments) -> int:
-    """Run the command."""
+    """Print what the estimate at a time is owed to."""
     twin = prepared(arguments)
     names = [state.name for state in twin.model.shown_states]
     for name in arguments.state:

@@ -20,7 +20,7 @@ ALL = "archive"
 
 
 def query(arguments: QueryCommand) -> int:
-    """Run the command."""
+    """Query an archive with SQL, and print the rows."""
     if arguments.json and arguments.csv:
         raise ConfigError("--json --csv: give one of them")
     result = result_of(arguments.folder, arguments.sql)

@@ -16,7 +16,7 @@ if TYPE_CHECKING:
 
 
 def export_filter(arguments: Arguments) -> int:
-    """Run the command."""
+    """Write the twin's filter as C99 code."""
     if not arguments.c:
         raise ConfigError("nisus export: name a language; --c writes C99")
     if arguments.events < 1:

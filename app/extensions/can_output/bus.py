@@ -25,7 +25,7 @@ FORMATS = (".asc", ".blf", ".csv", ".log", ".mf4", ".trc")
 
 
 def play_bus(arguments: BusCommand) -> int:
-    """Run the command."""
+    """Simulate the asset of a twin on a CAN bus."""
     if arguments.duration is not None and not arguments.duration > 0:
         raise ConfigError(f"--duration {arguments.duration:g}: must be positive")
     twin = load_twin(arguments.twin, overrides=overrides_of(arguments))

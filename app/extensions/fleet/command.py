@@ -52,7 +52,7 @@ FOLLOW_PERIOD_S, FOLLOW_SHARE = 2.0, 0.05
 
 
 def run_fleet(arguments: FleetCommand) -> int:
-    """Run the command."""
+    """Run a fleet, with its overview or until its files end."""
     out = arguments.out
     if out is not None and out.suffix not in (".csv", ".parquet"):
         raise ConfigError(f"--out {out}: must end in .csv or .parquet")

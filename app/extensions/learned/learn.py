@@ -40,7 +40,7 @@ STRETCHES = 9  # long parts of each recording over which errors add up to choose
 
 
 def learn_correction(arguments: Arguments) -> int:
-    """Run the command."""
+    """Learn the model error of a twin; return 0 if the correction is better, else 1."""
     corrects, features = names_of(arguments.corrects), names_of(arguments.features)
     for option, names in (("--corrects", corrects), ("--features", features)):
         if not names:

@@ -55,7 +55,7 @@ class TwinPlaces(NamedTuple):
 
 
 def serve(arguments: ServeCommand) -> int:
-    """Run the command."""
+    """Serve twins until Ctrl-C."""
     grants = _grants(arguments)
     twins, folder = _named(arguments.twins)
     split = parse_split(arguments.archive_split, arguments.archive_keep, "--archive")

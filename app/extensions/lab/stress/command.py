@@ -21,7 +21,7 @@ if TYPE_CHECKING:
 
 
 def stress_twin(arguments: Arguments) -> int:
-    """Run the command."""
+    """Run a twin with every fault, and print which are found."""
     twin = opened(arguments)
     if arguments.seeds < 1:
         raise ConfigError(f"--seeds {arguments.seeds}: must be 1 or more")
