@@ -27,8 +27,8 @@ T = TypeVar("T")
 class Part(NamedTuple):
     """One thing that an extension adds. Both are references, `module:name`, which are imported when they are needed.
 
-    `schema` is the class of what a user gives, if anything: a dataclass of options, or a `Section` of the YAML. `make`
-    is called with it, and with what `Extension` says. `text` describes a key in the schema of the YAML.
+    `schema` is the class of the user's settings, if any: a dataclass of options, or a `Section` of the YAML. `make` is
+    called with these and the arguments that `Extension` lists. `text` describes a key in the schema of the YAML.
     """
 
     schema: str
@@ -77,7 +77,7 @@ class Extension:
     """Routes beside those of the page, by path. `make(engine)` returns one, as `app.web.http.get` does."""
     panels: Parts = field(default_factory=dict)
     """Tabs of the page, by title. `make()` returns a JavaScript module, whose default export is called with the element
-    of the tab and what the page has: `{model, link, view, charts}` (`app/web/page/page.js`)."""
+    of the tab and objects of the page: `{model, link, view, charts}` (`app/web/page/page.js`)."""
 
 
 Kind = Literal[

@@ -150,7 +150,7 @@ class Section(BaseModel):
     def __get_pydantic_json_schema__(cls, core_schema: CoreSchema, handler: GetJsonSchemaHandler) -> dict[str, Any]:
         """Describe each key by the docstring under its field.
 
-        Pydantic's own `use_attribute_docstrings` parses every section at import, half of what the import took.
+        Pydantic's own `use_attribute_docstrings` parses every section at import, which took half of the import time.
         """
         schema = handler(core_schema)
         described = handler.resolve_ref_schema(schema)["properties"]

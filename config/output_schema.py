@@ -125,7 +125,7 @@ else:
 
 
 class OutputsSection(Outputs):
-    """Where the estimate is published, and who receives alerts. Nothing is published by default."""
+    """Publication of the estimate, and receivers of alerts. Nothing is published by default."""
 
     receivers: dict[Text, ReceiverSection] = {}
     """Receivers of alerts, by name. Default: none."""

@@ -45,7 +45,7 @@ S = TypeVar("S", bound=BaseModel)
 def check_section(kind: type[S], text: str, path: Path, rule: str) -> tuple[S, dict[str, Any], ValuePlaces]:
     """Check YAML against a schema; return the section, the data, and the place of each value.
 
-    `rule` says what the file must be, if it is no mapping.
+    `rule` ends the error text if the file is no mapping.
 
     Raises:
         ConfigError: With a line for each of the first problems.

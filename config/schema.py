@@ -149,10 +149,10 @@ class InstrumentSection(Section):
     """Offset and scale of a sensor or an input."""
 
     offset: OptionalParameter = None
-    """What it adds: a value, or {value, std, use} as a parameter, as in {std: 0.005}, in its unit. It becomes the
+    """Added offset: a value, or {value, std, use} as a parameter, as in {std: 0.005}, in its unit. It becomes the
     parameter NAME_offset (NAME_ROW_offset of several rows), which `parameters` may give in its place. Default: none."""
     scale: OptionalParameter = None
-    """By what it multiplies: a value, or {value, std, use} as a parameter, as in {std: 0.2 %}. It becomes the parameter
+    """Scale factor: a value, or {value, std, use} as a parameter, as in {std: 0.2 %}. It becomes the parameter
     NAME_scale (NAME_ROW_scale of several rows). Default: none."""
 
 
@@ -501,7 +501,7 @@ class TwinSection(Section):
     """Faults that are injected into the source: a list of {kind, sensor, input, start, end, size, rate, ...}. They act
     in this order, after those of a simulator. Default: none."""
     outputs: OutputsSection = OutputsSection()
-    """Where the estimate is published, and who receives alerts: {receivers, ...}. Default: nowhere but the page."""
+    """Publication of the estimate, and receivers of alerts: {receivers, ...}. Default: the page only."""
     alerts: tuple[AlertSection, ...] = ()
     """Rules for alerts to the receivers, as in [{health: suspect}, {state: winding, above: 150, probability: 0.05}].
     Default: {health: suspect} if there are receivers."""

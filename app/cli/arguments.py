@@ -342,8 +342,8 @@ class TuneCommand(JsonOption, ClusterOption, PartOptions, EstimatorOption, TwinO
     """Number of blocks with equally many measurements; every third is held out. 0 fits all of them and judges nothing.
     Default: 9, with --belief none 0."""
     belief: Literal["weak", "none"] = "weak"
-    """Prior about the values of the twin. weak: a factor of 10 in a standard deviation, and what the data do not
-    determine stays. none: plain maximum likelihood of every entry."""
+    """Prior about the values of the twin. weak: a factor of 10 in a standard deviation; entries that the data do
+    not determine keep their values. none: plain maximum likelihood of every entry."""
     windows: str | None = None
     """Dual estimation: fit one window of this length after another (600, 10min, 1h), as a running twin with `refit`
     does, and print every parameter over time. A shorter log is one window."""

@@ -21,7 +21,7 @@ if TYPE_CHECKING:
 
 
 def check_twin(arguments: Arguments) -> int:
-    """Fold the log of a twin, and print what is consistent and what is not."""
+    """Fold the log of a twin, and print the result of its check."""
     twin = prepared(arguments)
     log, counts = read_log(twin, arguments.duration)
     with executor_of(arguments.cluster, twin, with_held(twin), arguments.twin, overrides_of(arguments)) as executor:

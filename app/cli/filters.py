@@ -30,7 +30,7 @@ MIN_SAMPLE = 10
 
 
 def show_filters(arguments: Arguments) -> int:
-    """List the filters, describe one, or say which apply to a twin."""
+    """List the filters, describe one, or show which apply to a twin."""
     twin, shown = arguments.twin, ESTIMATORS
     if arguments.name in ESTIMATORS:
         shown = {arguments.name: ESTIMATORS[arguments.name]}

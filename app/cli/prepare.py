@@ -84,7 +84,7 @@ def prepare(twin: Twin) -> None:
 def compile_for(twin: Twin, workshop: Workshop | None = None) -> None:
     """Compile the twin's model and estimator, and what its source needs, or load them from the cache.
 
-    With a workshop it compiles all but the model in other processes, and the twin's estimator may take longer.
+    A workshop compiles everything but the model in other processes; the estimator may be ready only later.
 
     Raises:
         NisusError: If the model does not compile, or the estimator does not apply.

@@ -126,7 +126,7 @@ MAX_COMMANDS = 1000
 
 @dataclass(frozen=True)
 class AuditEntry:
-    """A request of a user that changed something: `at` in s since 1970, and what was sent.
+    """A user's request that changed something: `at` in s since 1970, `path` and `body` as sent.
 
     `address` is that of the client, `revision` the one that was shown. `change` counts the entries and their
     replacements: those of one gesture, such as the drag of a slider, are one entry.

@@ -83,7 +83,7 @@ class IdleTicks:
         """`tick`: seconds without events before the first prediction."""
         self._tick = tick
         self.since = time.monotonic()
-        """Monotonic time of the last arrival of what was used and folded, s."""
+        """Monotonic time of the last arrival of events that were used and folded, s."""
         self.late = 0.0
         """Age of the newest measurement when it arrived, s, of a source whose times are UTC."""
         self._newest: int | None = None

@@ -83,7 +83,7 @@ class RecordingFile:
         self.twin(twin)
 
     def twin(self, twin: Twin) -> None:
-        """Write the twin's YAML, what the command line changed in it, and its tuning version; the last ones count."""
+        """Write the twin's YAML, its overrides from the command line, and its tuning version; the last ones count."""
         more = {"yaml": twin.text, "overrides": json.dumps(dict(twin.overrides))}
         if twin.version is not None:
             more["version"] = version_to_json(twin.version)

@@ -99,7 +99,7 @@ class TruthNees(NamedTuple):
 
 @dataclass(frozen=True)
 class FoldResult:
-    """A finished fold, and what is measured on it, each once when first needed.
+    """A finished fold and its scores, each computed once when first needed.
 
     `seconds` is the time per event, `part` the scored rows, `known` the states whose NEES is computed.
     """

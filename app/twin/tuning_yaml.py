@@ -44,8 +44,8 @@ def tuning_yaml(
         whole: Whether other content of these sections (limits of a sensor, options of other filters) is kept, without
             its comments. If not, they have the tuned entries only, with every parameter.
         widths: Covariance that a fit gives the parameters, but with `whole` the spread between specimens of those that
-            have a `std`; and the range of its data, which becomes the range of validity of what has one, or widens a
-            parameter.
+            have a `std`; and the ranges of its data, which become the ranges of validity of states and inputs that have
+            one or widen a parameter.
     """
     entry, first = find_entry(estimator), config.estimator
     options = {name: _option(entry, name, value) for name, value in tuning.options.items()}

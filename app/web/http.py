@@ -54,7 +54,7 @@ RULES = {
 
 
 class Operation(NamedTuple):
-    """Endpoint for its description: the function, its fields, where they are sent, and what it answers.
+    """Endpoint for the API's description: function, fields and their place, status and type of the answer.
 
     `fields` is None if `body` returns the JSON Schema of the body.
     """

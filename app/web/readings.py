@@ -208,7 +208,7 @@ def _of_arrow(body: bytes, fields: Sequence[str]) -> Sequence[Any]:
 
 
 def _is_compressed(message: bytes) -> bool:
-    """Return whether the metadata of an Arrow message (a flatbuffer) tell of a batch whose buffers are compressed.
+    """Return whether the metadata of an Arrow message (a flatbuffer) describe a batch with compressed buffers.
 
     Source: Apache Arrow, format/Message.fbs. Message has header_type and header as fields 1 and 2, RecordBatch has
     compression as field 3.

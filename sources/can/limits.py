@@ -15,8 +15,8 @@ NO_VALUE = re.compile(
     r"(value|signal|data)?(or.*)?"
 )
 ERROR = re.compile(r"(signal|sensor|value|data)*(err|error|faulty?|failure)(indicator|code|value|signal|state)?(or.*)?")
-"""Names, in lower case and of letters alone, of codes that say that there is no value, and of errors, which a signal
-may have as a state if all of its values are named."""
+"""Names of codes for a missing value and for an error, in lower case, letters only. A signal may have an error as a
+state if all of its values are named."""
 
 
 class Limits:

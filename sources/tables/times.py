@@ -46,7 +46,7 @@ _NAMED_DAY = re.compile(r"(?<!\d)((?:19|20)\d\d)([-_.]?)(0[1-9]|1[0-2])\2(0[1-9]
 
 MAX_CLOCK_STEP_BACK_NS = 3600 * 10**9  # By which a clock without a date goes back within one day
 TWICE, SKIPPED, ASSUMED = "hour that occurs twice", "hour that never occurs", "time assumed"
-"""Keys of rows whose time follows from the order of the rows, and of what was assumed once for all rows."""
+"""Keys of notes: times that follow from the order of the rows, and assumptions made once for all rows."""
 TAIL_ROWS = 256  # Rows before the clock is set from which the usual interval is taken
 
 MAX_DETECTION_CELLS = 4096  # Cells from which the order of day and month is taken

@@ -26,10 +26,10 @@ any byte, and NumPy sums those in another order: not the same bits."""
 MAX_KEPT = 4  # functions that a worker keeps, the last ones
 
 _functions: list[Callable[..., Any]] = []
-"""Of a worker: the functions of the models of the twin that it has loaded."""
+"""Model functions of the twin that this worker has loaded."""
 
 _kept: dict[str, Callable[..., Any]] = {}
-"""Of a worker: functions that were sent to it, by their key."""
+"""Functions that were sent to this worker, by key."""
 
 
 @contextmanager

@@ -29,7 +29,7 @@ WATCH_S = 5.0  # seconds between two looks whether a cluster has a worker
 _REMEDY = "give the address of a Dask scheduler, as in tcp://127.0.0.1:8786, or local:4 for four processes here"
 
 _turn, _begun = threading.Lock(), [""]
-"""Of a worker of a cluster: one call at a time, and the work whose `begin` has been called."""
+"""Lock for one call at a time on this worker, and the work whose `begin` has been called."""
 
 
 class Cluster:

@@ -54,7 +54,7 @@ class FleetArchive:
             model: Model of the assets.
             names: Names of the assets by position; may grow, and have another one when an asset is forgotten.
             report: Called as report(key, text) for what cannot be written, also from the thread of the archive.
-            stored: What the store had of `written`; empty or None without it.
+            stored: Last entry from `written` in the store; empty or None without one.
         """
         self._folder, self._split = plan
         self._model, self._names, self._report = model, names, report

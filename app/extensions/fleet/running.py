@@ -311,7 +311,7 @@ class RunningFleet:
         self._heard[at] = self.clock()
 
     def _room(self, name: str) -> float:
-        """Return how many assets can still come, from any thread; infinity for one that is there."""
+        """Return how many assets can still be added, from any thread; infinity for a known one or without a limit."""
         known = self._most is None or name in self._places
         return math.inf if known else (self._most or 0) - len(self.names) + len(self._once)
 
@@ -365,8 +365,8 @@ class RunningFleet:
     def _query(self, period: int) -> None:
         """Show the assets that have been silent for long as of now, if the last look is `period` ns ago.
 
-        Now is of a live source the last time of each asset, and what has gone by since it arrived: its clock need not
-        be that of others.
+        For a live source, now is each asset's last time plus the time since its arrival: the clocks of assets may
+        differ.
         """
         live = self.source.live
         now = self.clock() if live else self.source.now()

@@ -82,7 +82,7 @@ class FleetAlertSection(Section):
 
 
 class FleetOutputsSection(Section):
-    """Where the estimates of all assets are published, and who receives alerts. Nothing is published by default."""
+    """Publication of the estimates of all assets, and receivers of alerts. Nothing is published by default."""
 
     every: Duration = 1.0
     """Seconds between two states of an asset that are published, if it has changed. Default: 1."""

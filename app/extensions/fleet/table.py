@@ -107,7 +107,7 @@ def arrow_table(model: StateSpaceModel, table: FleetTable, order: np.ndarray | N
     """Return a pyarrow.Table with a row for each asset, in an order.
 
     Columns: `asset`, `health` and `cause` (or null); `NAME` and `NAME_std` for each state; `nis_mean`, `nis_low`,
-    `nis_high`; `seconds` of the last event, `since` when health is what it is, `age` of the last measurement, `verdict`
+    `nis_high`; `seconds` of the last event, `since` (last change of health), `age` of the last measurement, `verdict`
     on the last event; `events` folded and `stale`, those dropped as too late.
     """
     import pyarrow as pa

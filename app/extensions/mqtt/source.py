@@ -53,7 +53,7 @@ NO_EXPIRY_S = 2**32 - 1
 
 
 class TopicMap(TopicSection):
-    """Where the payloads of a topic have their values, and which level of the topic is the name of the asset."""
+    """Location of the values in the payloads of a topic, and the topic level that names the asset."""
 
     asset: int | None = None
     """Level of the topic with the name of the asset, counted from 0. Default: none."""

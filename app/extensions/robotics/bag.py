@@ -94,7 +94,7 @@ def _first(topics: dict[str, BagTopic], wanted: set[str], messages: Messages) ->
 
 
 def read_bag(path: Path, time: str, columns: Sequence[Column], problem: Problem) -> Generator[Chunk, None, None]:
-    """Yield the messages of the topics of these columns; what a message does not have is blank.
+    """Yield the messages of the topics of these columns; columns that a message lacks are blank.
 
     Raises:
         SourceError: If the bag cannot be read, or not any further.

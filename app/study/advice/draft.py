@@ -539,7 +539,7 @@ def check_lines(check: DraftCheck) -> list[str]:
 
 
 def _channel(name: str, one: Signal, family: Family | None = None) -> str:
-    """Where the values of a sensor or input are found, or those of a family."""
+    """Return the YAML line with the location of the values of a sensor, an input or a family."""
     column = one.series.column or one.series.name
     fields = {"columns": _text(column)} if one.message is None else {"message": _text(one.message)}
     if one.message is not None:

@@ -217,7 +217,7 @@ def _written(item: Moves, noise: str, structure: Structure, model: StateSpaceMod
 
 
 class DraftStep(NamedTuple):
-    """Progress of a draft: what is under way, and at the end the draft's file and its content in words."""
+    """Progress of a draft: the present step, and at the end the draft's file and its content in words."""
 
     doing: str
     file: str | None = None

@@ -51,7 +51,7 @@ class Exclusion(NamedTuple):
 
 
 def without_faults(twin: Twin, log: Log, known: Sequence[Episode] | None = None) -> tuple[Log, tuple[Exclusion, ...]]:
-    """Return the log without the readings of sensors in fault episodes, and what was left out.
+    """Return the log without the readings of sensors in fault episodes, and these exclusions.
 
     A fault is an alarm for which the sensor, not the tuning, is examined: biased, rejected, stuck, beyond its limits. A
     row that is in fault for most of the log keeps its readings: they are what the twin has to explain. Episodes that
@@ -200,8 +200,8 @@ YES, NO, UNTOLD = "yes", "no", "not told"
 class Claim:
     """A question and its answer.
 
-    `figure` is the number that decides, `threshold` what it is compared with, and `of` says what both are, with the
-    unit; the figure is None where nothing could be measured, and `answer` is then declared by the model or "not
+    `figure` is the number that decides, `threshold` the limit that it is compared with, and `of` names their quantity
+    and unit; the figure is None where nothing could be measured, and `answer` is then declared by the model or "not
     told". `reason` has the arithmetic; `remedy` is what to do beside the choice of a filter, if anything.
     """
 

@@ -82,7 +82,7 @@ class Moves:
     """One state, how it moves, and the sensors that read it, its own first.
 
     `smooth`: with a speed of its own, which is a second state. With `lag` it follows inputs, whose names are `inputs`,
-    and the speed is what they leave unexplained.
+    and the speed is the part that they do not explain.
     `q` is the variance that the noise adds in one second, to the speed if there is one; `over` is its correlation time,
     s, None for white noise. `cycle` is the period, s, and the amplitude of a cycle that the draft does not have.
     """
@@ -360,7 +360,7 @@ def _role(
 ) -> SignalRole:
     """Return the role of a signal, and why it has it; `rest` is why signals that vary were not picked.
 
-    `used_as` is what the plan has of it, among `picked`; None if nothing.
+    `used_as` is the signal among `picked` that the plan uses for it; None without one.
     """
     k = next((k for k, other in enumerate(picked) if other is used_as), None)
     if k is None:

@@ -52,7 +52,7 @@ class Recordings:
     def entries(self, busy: Callable[[Path], bool] = lambda path: False) -> list[dict[str, Any]]:
         """Return the files, newest first: facts of a recording, or an `error`; `folder` is set outside this one.
 
-        Facts are read in a thread, for the next call; `looking` says that they are missing.
+        Facts are read in a thread, for the next call; `looking` is true while they are missing.
 
         Args:
             busy: Whether a file is being written.

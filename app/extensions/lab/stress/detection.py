@@ -77,8 +77,8 @@ class Oracle:
     def listed(self, bench: Bench, mistake: Mistake, estimator: str) -> bool:
         """Return whether `nisus check` lists every part of a mistake as undetectable, on the undamaged log.
 
-        Where it computes nothing, it says that any fault may be. Faults at once are undetectable, too, if their effects
-        cancel.
+        If the check computes nothing, any fault counts as listed. Simultaneous faults are also undetectable if their
+        effects cancel.
 
         Raises:
             NisusError: As `Bench.run`.

@@ -317,7 +317,7 @@ def said_at(fold: Fold, episode: Episode) -> int:
 
 
 def quiet_of(mistake: Mistake) -> tuple[int, ...]:
-    """Return the grades of health that say nothing of a mistake: an advisory tells a fault, and is no false alarm."""
+    """Return the health grades that are no detection: an advisory detects a fault, but is no false alarm."""
     return (TRACKING,) if mistake.causes else USABLE
 
 

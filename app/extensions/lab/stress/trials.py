@@ -15,7 +15,7 @@ from .scenario import Bench, Mistake, asset_of
 
 
 class Trials:
-    """The mistakes with a twin, the logs that they are made in, and what is foretold of them.
+    """Mistakes with a twin, the logs in which they are made, and their expected detection.
 
     Args:
         twin: As it ships.
