@@ -274,8 +274,8 @@ def test_an_edit_between_a_pull_and_its_tuning_is_written_once(tmp_path, monkeyp
     before = stepped.engine.tuning.get("Q.rate")
     monkeypatch.setattr(RecordingFile, "tuning", lambda _, now, *at: written.append((at[-1], now.get("Q.rate"))))
 
-    def pull_then_edit(*request):
-        found = pull(*request)
+    def pull_then_edit(*request, **named):
+        found = pull(*request, **named)
         if found.revision == 0:
             stepped.submit(commands.SetTuning("Q.rate", 0.5))
         return found
