@@ -146,7 +146,7 @@ def test_a_folder_that_cannot_be_written_is_one_notice_and_loses_nothing(tmp_pat
     (tmp_path / "winding").unlink()
     session.put(batch.select(slice(900, 1500)))
     free = archives.Disk.free
-    monkeypatch.setattr(archives.Part, "write", lambda *_: (_ for _ in ()).throw(OSError(28, "No space left")))
+    monkeypatch.setattr(archives.ParquetPart, "write", lambda *_: (_ for _ in ()).throw(OSError(28, "No space left")))
     session.put(batch.select(slice(1500, 1700)))
     session.archive.look(closing=True)
     assert list((tmp_path / "winding").glob("*")) == []
@@ -178,7 +178,7 @@ def test_a_killed_process_leaves_complete_files_and_its_store_continues_them(tmp
         *(batch.select(slice(k, k + 100)) for k in range(0, 3000, 100))
     )
     session.running.store.look()
-    session.archive._part = archives.Part(tmp_path / "winding")
+    session.archive._part = archives.ParquetPart(tmp_path / "winding")
     session.running.store._store.close()
     session.archive._part._file.close()  # as the end of the process does, and with it the lock
     assert 2000 < len(rows(tmp_path)) < 3000
