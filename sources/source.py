@@ -78,7 +78,7 @@ class Marked(Source, Protocol):
     """A live source that counts what it has read, and can continue there after a restart."""
 
     mark: int
-    """Count of what was read."""
+    """Number of items that were read."""
 
     def numbers(self, mark: int) -> Mapping[str, Any]:
         """Return the state after `mark`, for `restore`; in one thread, with rising marks."""
@@ -183,7 +183,7 @@ class Channel:
     `kind` is READING, INPUT or TRUTH and `index` that of the sensor, input or state. `signals` are signals of the CAN
     `message`, or columns of a table, one for each row. A value is converted from its unit to the model's and becomes
     scale * value + offset. `units` None means the DBC's own unit, or the model's where that is empty too.
-    Where a condition of `where` fails, the value is missing; where one of `only` fails, the row or frame is ignored.
+    The value is missing if a condition of `where` fails; the row or frame is ignored if one of `only` fails.
     With convert "east_north" the two signals are latitude and longitude in degrees and become metres east and north of
     `origin`, which is the first valid fix unless given. `accuracy` is reported with a sensor's measurements.
     `repeats` None uses every row; 0 those whose value differs from the one before; else also one every so many seconds.
@@ -206,7 +206,7 @@ class Channel:
     repeats: float | None = None
 
     def __post_init__(self) -> None:
-        """Spread the defaults, and what one entry gives for all, over the rows."""
+        """Spread the defaults, and entries that are given once for all, over the rows."""
         count = len(self.signals)
         for field, default in (("units", None), ("model_units", ""), ("scale", 1.0), ("offset", 0.0)):
             value = tuple(getattr(self, field)) or (default,)

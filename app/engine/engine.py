@@ -140,6 +140,9 @@ class Engine(Running):
         self._prompt: int | None = None
         """Time of the newest event when measurements were last used in time, ns."""
         self.jobs = Jobs(self.notices)
+        # Short ones, which must not wait for fits of minutes.
+        self.monitors = Jobs(self.notices, "monitor", threads=1)
+        self._pools = self._refolds, self.jobs, self.monitors
         self._watchers = Watchers(self)
         self.revisions.said = self._watchers.episodes_of
         self.recorder: Records | None = None
@@ -185,7 +188,7 @@ class Engine(Running):
 
     def start(self) -> None:
         """Begin to read and fold."""
-        for part in (self._watching, self._refolds, self._thread, self._feeder, self._watchers, self.jobs):
+        for part in (self._watching, self._thread, self._feeder, self._watchers, *self._pools):
             part.start()
         if self._awaited is not None:
             self._inbox.put(partial(self._compiled, self._awaited))
@@ -193,7 +196,7 @@ class Engine(Running):
     def stop(self) -> None:
         """Stop reading and folding."""
         self._stopping.set()
-        run_all(self._join, self._feeder.stop, self._workshop.stop, self._refolds.stop, self.jobs.stop)
+        run_all(self._join, self._feeder.stop, self._workshop.stop, *(pool.stop for pool in self._pools))
         self._watchers.episode_log.stop()
         self._watching.stopping.set()
 
@@ -204,7 +207,7 @@ class Engine(Running):
 
     def settle(self) -> None:
         """Carry out all that waits (events, commands, refolds, jobs) in this thread, for an engine without `start`."""
-        while self._feeder.read(0.0) or not self._inbox.empty() or self._refolds.step() or self.jobs.step():
+        while self._feeder.read(0.0) or not self._inbox.empty() or any(pool.step() for pool in self._pools):
             if not self._inbox.empty():
                 self._round(0.0)
 

@@ -20,8 +20,8 @@ from estimators.errors import reason_of
 
 from .notices import Notices
 
-MAX_JOBS = 4
-"""Jobs that run at once; the others wait. A fit, an advice and a smoother may each take minutes, beside monitors."""
+MAX_JOBS = 3
+"""Jobs that run at once; the others wait. A fit, an advice and a smoother may each take minutes."""
 
 LOWEST_PRIORITY = 19
 """Niceness of the threads."""

@@ -107,6 +107,7 @@ class Running(ABC):
     """
 
     jobs: Jobs
+    monitors: Jobs
     recorder: Records | None
     published: Published | None = None
     """Outputs of the twin, None if it has none."""

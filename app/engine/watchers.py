@@ -34,7 +34,7 @@ class Watchers:
 
     def __init__(self, engine: Running) -> None:
         section, notices = engine.twin.config.time, engine.notices
-        self._jobs, self._notices = engine.jobs, notices
+        self._jobs, self._monitors, self._notices = engine.jobs, engine.monitors, notices
         self.latency = Latency()
         self.clock = HostClock(notices, section.horizon)
         self.dropped = DroppedShare()
@@ -49,10 +49,10 @@ class Watchers:
 
     def start(self) -> None:
         """Begin to monitor."""
-        self._jobs.run("episodes", self.episode_log.look, every=EPISODES_PERIOD_S)
+        self._monitors.run("episodes", self.episode_log.look, every=EPISODES_PERIOD_S)
         self._jobs.run("protection levels", self.integrity.look, every=LEVELS_PERIOD_S)
         self._jobs.run("root cause", self.root_cause.update, every=ROOT_CAUSE_PERIOD_S)
-        self._jobs.run("repeated values", self.repeats.look, every=REPEATS_PERIOD_S)
+        self._monitors.run("repeated values", self.repeats.look, every=REPEATS_PERIOD_S)
 
     def arrived(self, batch: Events, passed: Events) -> None:
         """Note a batch of a live source that was folded, and those of its events that passed."""

@@ -13,12 +13,11 @@ from anyio import CapacityLimiter, to_thread
 T = TypeVar("T")
 
 REQUEST_THREADS = 4
-"""Threads for requests and files, each with a stack of its own. Work that takes long has a thread or a job of its own,
-and the interpreter runs one thread at a time: with twelve, pages were answered no sooner."""
+"""Threads for requests and files; AnyIO alone would start up to forty. The interpreter runs one at a time, and work
+that takes long has a thread or a job of its own."""
 
 ONE_AT_A_TIME = CapacityLimiter(1)
-"""For the feeds of all Rerun viewers: Rerun's allocator keeps free memory for each thread that has used it, so Explore
-took 15 MB more in twelve threads."""
+"""For the feeds of all Rerun viewers: Rerun's allocator keeps free memory for each thread that has used it at once."""
 
 
 async def in_thread(work: Callable[..., T], *arguments: Any, limiter: CapacityLimiter | None = None, **named: Any) -> T:

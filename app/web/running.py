@@ -130,7 +130,7 @@ class RunningTwin:
         for level, text in remarks:
             self.engine.notices.say(text, level=level)
         self._next_line, self._printed = 0, printed
-        self.engine.jobs.run("lines", lambda job: self._print_notices(), every=PRINT_PERIOD_S)
+        self.engine.monitors.run("lines", lambda job: self._print_notices(), every=PRINT_PERIOD_S)
         self.recorder = Recorder(self.engine, self._draw_into, split, recordings or Path())
         self.engine.recorder = self.recorder
         self.refits = Refits(self.engine)

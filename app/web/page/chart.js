@@ -139,7 +139,7 @@ export class Chart {
     );
     if (this.actions.wheel) this.plot.over.addEventListener("wheel", (event) => this.actions.wheel(event, this.plot), { passive: false });
     if (this.actions.note) {
-      let pressed = 0; // px; what is dragged zooms, and is no click
+      let pressed = 0; // px; a drag zooms, and is no click
       this.plot.over.addEventListener("pointerdown", (event) => (pressed = event.clientX));
       this.plot.over.addEventListener("click", (event) => event.altKey && Math.abs(event.clientX - pressed) < MIN_DRAG && this.actions.note(this.plot.posToVal(event.offsetX, "x"), this.notesAt(event.offsetX)[0]));
     }

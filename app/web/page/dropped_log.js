@@ -100,7 +100,7 @@ export class LogView {
     return element("div", { class: "log-body" }, signals, element("aside", { class: "log-side", "aria-label": "Twins for this log" }, this.drafting(log), ...this.twins(log)));
   }
 
-  // What a CAN log needs, and the databases that are here.
+  // The need of a CAN log, and the databases at hand.
   databases(log) {
     const toggle = (one) => this.read({ dbc: log.databases.filter((other) => (other === one) !== other.used).map((other) => other.name) });
     const known = log.databases.map((one) => element("li", {},

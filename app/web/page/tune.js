@@ -86,7 +86,7 @@ export class Tune {
     return section(title, HINTS[prefix], items.length <= MAX_OPEN_ENTRIES, all, ...body);
   }
 
-  // A search field, and the first of what it finds.
+  // A search field, and its first results.
   found(title, items, nameOf, nodeOf) {
     const list = element("div", {});
     const left = element("p", { class: "about" });

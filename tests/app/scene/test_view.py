@@ -6,6 +6,7 @@ import http.client
 import os
 import socket
 import threading
+from contextlib import ExitStack
 from dataclasses import replace
 from types import SimpleNamespace
 
@@ -48,14 +49,22 @@ def engine():
 
 
 @pytest.fixture
-def view(engine):
-    """A view that has drawn one frame."""
-    view = ViserView(engine, secret="s3cret")
-    try:
-        view.frame()
-        yield view
-    finally:
-        view.stop()
+def framed():
+    """Makes views that have drawn one frame."""
+    with ExitStack() as ends:
+
+        def frame(engine):
+            view = ViserView(engine, secret="s3cret")
+            ends.callback(view.stop)
+            view.frame()
+            return view
+
+        yield frame
+
+
+@pytest.fixture
+def view(engine, framed):
+    return framed(engine)
 
 
 # Who may connect
@@ -183,17 +192,13 @@ def test_belief_scene_follows_the_estimate(view, engine):
     assert labels[0] < belief.mean[0] < labels[-1]
 
 
-def test_blocks_of_true_states_are_drawn(engine):
+def test_blocks_of_true_states_are_drawn(engine, framed):
     """Both states in one event, the second not always known: the belief's point gets the last of each."""
     t = 100.0 + np.arange(5)
     block = np.stack((50.0 + t, [0.1, np.nan, 0.3, 0.4, np.nan]), axis=1)
     engine.put(events(WINDING, TRUTH, 0, t, block))
-    view = ViserView(engine, secret="x")
-    try:
-        view.frame()
-        np.testing.assert_array_equal(view.stage.scene._true_point(view.history, [1, 0]), [[0.4, 154.0]])
-    finally:
-        view.stop()
+    view = framed(engine)
+    np.testing.assert_array_equal(view.stage.scene._true_point(view.history, [1, 0]), [[0.4, 154.0]])
 
 
 def test_peaks_are_marked_with_their_weights_while_there_are_several(view, engine):
@@ -254,7 +259,7 @@ def test_the_first_view_holds_all_walls_and_stays_until_it_is_to_follow(server):
     scene.root.remove()
 
 
-def test_vehicle_scene_keeps_the_vehicle_in_the_middle():
+def test_vehicle_scene_keeps_the_vehicle_in_the_middle(framed):
     def f(x, u, p, dt, out):
         out[0] = x[0] + dt * x[2]
         out[1] = x[1]
@@ -273,17 +278,13 @@ def test_vehicle_scene_keeps_the_vehicle_in_the_middle():
     engine.put(events(model, READING, 0, t, np.stack((10 * t, 0 * t), axis=1)))
     north = np.where(t == 30.0, np.nan, 3.0)
     engine.put(events(model, TRUTH, 0, t, np.stack((10 * t, north), axis=1)))
-    view = ViserView(engine, secret="x")
-    try:
-        view.frame()
-        np.testing.assert_allclose(view.stage.scene.world.position, [-600.0, 0.0, 0.0], atol=2.0)
-        np.testing.assert_allclose(view.stage.scene._vehicle.position[:2], engine.belief().mean[:2], atol=1e-6)
-        assert view.stage.scene._readings.points.shape == (60, 3)
-        way = np.unique(np.asarray(view.stage.scene._truth.points).reshape(-1, 3), axis=0)
-        np.testing.assert_allclose(way[:, 0], 10 * t[t != 30.0], err_msg="where both true states are known")
-        np.testing.assert_allclose(way[:, 1], 3.0)
-        assert view.stage.scene._course == pytest.approx(0.0, abs=0.05)
-        cov = engine.belief().cov[:2, :2]
-        np.testing.assert_allclose(view.stage.scene._ellipse.scale[:2], 2 * np.sqrt(np.linalg.eigvalsh(cov)), rtol=1e-6)
-    finally:
-        view.stop()
+    view = framed(engine)
+    np.testing.assert_allclose(view.stage.scene.world.position, [-600.0, 0.0, 0.0], atol=2.0)
+    np.testing.assert_allclose(view.stage.scene._vehicle.position[:2], engine.belief().mean[:2], atol=1e-6)
+    assert view.stage.scene._readings.points.shape == (60, 3)
+    way = np.unique(np.asarray(view.stage.scene._truth.points).reshape(-1, 3), axis=0)
+    np.testing.assert_allclose(way[:, 0], 10 * t[t != 30.0], err_msg="where both true states are known")
+    np.testing.assert_allclose(way[:, 1], 3.0)
+    assert view.stage.scene._course == pytest.approx(0.0, abs=0.05)
+    cov = engine.belief().cov[:2, :2]
+    np.testing.assert_allclose(view.stage.scene._ellipse.scale[:2], 2 * np.sqrt(np.linalg.eigvalsh(cov)), rtol=1e-6)

@@ -61,8 +61,7 @@ def same(one, other):
 
 
 def edited(engine, key, number):
-    """Make an edit that begins this revision, unless a test before has made it."""
-    if engine.status().revision < number:
+    if engine.status().revision < number:  # no test before has made it
         engine.submit(SetTuning(key, 0.5))
         wait_for(lambda: engine.status().revision == number)
 

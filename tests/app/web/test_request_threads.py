@@ -1,9 +1,9 @@
 """Threads of requests: their number, results, errors, cancelled requests."""
 
 import asyncio
-import socket
 import threading
-from contextlib import ExitStack
+from concurrent.futures import ThreadPoolExecutor
+from http.client import HTTPConnection
 from unittest.mock import AsyncMock
 
 import pytest
@@ -34,20 +34,19 @@ def test_requests_share_the_stated_number_of_threads():
             found = PlainTextResponse(str(error))
         await found(scope, receive, send)
 
+    def ask(_):
+        connection = HTTPConnection("127.0.0.1", served.port, timeout=LIMIT_S)
+        connection.request("GET", "/api/x", headers={"Authorization": f"Bearer {served.token}"})
+        return connection.getresponse().read()
+
     served.show(answer)
     served.start()
-    with ExitStack() as ends:
-        ends.callback(served.stop)
-        ends.callback(go_on.set)
-        head = f"GET /api/x HTTP/1.1\r\nHost: 127.0.0.1\r\nAuthorization: Bearer {served.token}\r\n"
-        asked = []
-        for _ in range(REQUEST_THREADS + 3):
-            asked.append(ends.enter_context(socket.create_connection(("127.0.0.1", served.port), LIMIT_S)))
-            asked[-1].sendall(f"{head}Connection: close\r\n\r\n".encode())
+    with ThreadPoolExecutor(REQUEST_THREADS + 3) as browsers:
+        answers = browsers.map(ask, range(REQUEST_THREADS + 3))
         wait_for(lambda: len(at_work) == REQUEST_THREADS)
         go_on.set()
-        answers = [one.makefile("rb").read().rpartition(b"\r\n")[2] for one in asked]
         assert sorted(set(answers)) == [b"here", b"the seventh"] and len(set(at_work)) == REQUEST_THREADS
+    served.stop()
 
 
 def test_a_cancelled_request_ends_after_its_work():
