@@ -147,7 +147,8 @@ class Engine(Running):
         self.revisions.said = self._watchers.episodes_of
         self.recorder: Records | None = None
         self.store: Keeper | None = None
-        self._status: tuple[float, Status] | None = (-np.inf, self._status_now())
+        self._telling = threading.Lock()
+        self._status = (-np.inf, self._status_now())
         self._thread = threading.Thread(target=self._run, name="engine", daemon=True)
         if stored is not None:
             self._go_on_from(stored.tail)
@@ -250,18 +251,19 @@ class Engine(Running):
 
     def status(self) -> Status:
         """See `Running`."""
-        last = self._status
-        if last is not None and time.monotonic() - last[0] < STATUS_PERIOD_S:
-            return self._with_lag(last[1])
-        with self._reading(np.inf if last is None else STATUS_TIMEOUT_S) as still:
-            if still or last is None:
-                status = self._status_now()
-            else:
-                # A refold counts as waiting until the revision that came of it is shown.
-                fields = self._known_fields(self._requests.waiting or last[1].revision != self._revision)
-                status = busy_status(last[1], fields, self._watchdog.busy)
-        if self._status is last:  # what was asked for meanwhile is not in this one
-            self._status = (time.monotonic(), status)
+        with self._telling:  # one after the other, so that none replaces a newer one
+            last, now = self._status, time.monotonic()
+            if now - last[0] < STATUS_PERIOD_S:
+                return self._with_lag(last[1])
+            with self._reading(STATUS_TIMEOUT_S) as still:
+                if still:
+                    status = self._status_now()
+                else:
+                    # A refold counts as waiting until the revision that came of it is shown.
+                    fields = self._known_fields(self._requests.waiting or last[1].revision != self._revision)
+                    status = busy_status(last[1], fields, self._watchdog.busy)
+            if self._status is last:  # what was asked for meanwhile is not in this one
+                self._status = (now, status)
         return self._with_lag(status)
 
     def _with_lag(self, status: Status) -> Status:
@@ -522,8 +524,7 @@ class Engine(Running):
         with self._lock:
             self.estimator, self.tuning, self._gesture = estimator, tuning, gesture
         self._awaited = None if self._workshop.ready(estimator) else estimator
-        if (last := self._status) is not None:
-            self._status = (-np.inf, last[1])
+        self._status = (-np.inf, self._status[1])
         if self._awaited is not None:
             self._workshop.ask(estimator, lambda name: self._inbox.put(partial(self._compiled, name)))
             return

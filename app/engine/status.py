@@ -38,7 +38,8 @@ def busy_status(last: Status, fields: Mapping[str, Any], busy: float) -> Status:
     """Return the last status of a fold that has been at work for `busy` seconds, with the present known fields."""
     if last.t is None and busy >= 1.0 and fields["awaited"] is None:
         fields = {**fields, "cause": f"{FOLDING_CAUSE} ({busy:.0f} s so far)"}
-    return replace(last, **fields)
+    # It has not ended before its last rows are told.
+    return replace(last, **{**fields, "finished": fields["finished"] and last.finished})
 
 
 def status_of(

@@ -5,8 +5,11 @@ Most tests drive an engine without threads (`Stepped`); those with `started` nee
 
 import itertools
 import re
+import threading
 import time
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -20,6 +23,7 @@ from app.engine.failure_notices import Alerts
 from app.engine.feeder import SourceBatch
 from app.engine.jobs import Job
 from app.engine.notices import Notices
+from app.engine.status import busy_status
 from app.twin.twin import load_twin
 from estimators.fold import Fold, fold
 from estimators.log import READING, Events, Log
@@ -273,6 +277,48 @@ def test_after_the_end_of_the_source_the_estimate_can_still_be_retuned():
     stepped.engine._finish()
     stepped.submit(commands.SetEstimator("ekf"))
     assert stepped.status().finished and pull_all(stepped.engine).revision == 1
+
+
+def test_a_fold_at_work_has_not_ended_before_its_last_rows_are_told():
+    stepped = Stepped(3)
+    engine, before = stepped.engine, stepped.status()
+    engine.settle()
+    with engine._moving():  # by this thread, so that a status cannot read the fold
+        engine._finished = True
+        with ThreadPoolExecutor(1) as pool:
+            told = pool.submit(stepped.status).result()
+    assert (told.t, told.finished) == (before.t, False)
+    assert stepped.status().finished
+
+
+def test_a_status_does_not_replace_a_newer_one(monkeypatch):
+    engine = Stepped(3).engine
+    engine._status = (-np.inf, engine.status())
+    entered, leave = threading.Semaphore(0), [threading.Event(), threading.Event()]
+    waits = iter(leave)
+
+    def slow(compute):
+        def computed(*given):
+            status = compute(*given)
+            entered.release()
+            assert next(waits).wait(10.0)
+            return status
+
+        return computed
+
+    monkeypatch.setattr(engine, "_status_now", slow(engine._status_now))
+    monkeypatch.setattr("app.engine.engine.busy_status", slow(busy_status))
+    with ThreadPoolExecutor(2) as pool:
+        older = pool.submit(engine.status)
+        assert entered.acquire(timeout=10.0)
+        engine.recorder = SimpleNamespace(path="new.rrd")
+        newer = pool.submit(engine.status)
+        entered.acquire(timeout=0.3)  # before: both compute at once
+        leave[0].set()
+        assert older.result().recording is None
+        leave[1].set()
+        assert newer.result().recording == "new.rrd"
+    assert engine.status().recording == "new.rrd"
 
 
 def test_without_measurements_a_live_twin_predicts(started):
