@@ -47,8 +47,6 @@ def refused(
 Number = Annotated[float, Field(strict=True, allow_inf_nan=False, ge=-LARGEST, le=LARGEST)]
 Positive = Annotated[float, Field(strict=True, allow_inf_nan=False, gt=0, le=LARGEST)]
 NotNegative = Annotated[float, Field(strict=True, allow_inf_nan=False, ge=0, le=LARGEST)]
-Seconds = Annotated[float, Field(strict=True, allow_inf_nan=False, gt=0, le=MAX_DURATION_S)]
-SomeSeconds = Annotated[float, Field(strict=True, allow_inf_nan=False, ge=0, le=MAX_DURATION_S)]
 TIME_UNITS = {"ms": 1e-3, "s": 1.0, "min": 60.0, "h": 3600.0, "d": 86400.0}
 """Units in which a duration may be given, in seconds."""
 
@@ -65,7 +63,10 @@ def as_seconds(value: Any) -> Any:
         raise refused("value", rule) from None
 
 
-Duration = Annotated[Seconds, BeforeValidator(as_seconds, json_schema_input_type=Seconds | str)]
+AS_SECONDS = BeforeValidator(as_seconds, json_schema_input_type=float | str)
+Duration = Annotated[float, Field(strict=True, allow_inf_nan=False, gt=0, le=MAX_DURATION_S), AS_SECONDS]
+DurationOrZero = Annotated[float, Field(strict=True, allow_inf_nan=False, ge=0, le=MAX_DURATION_S), AS_SECONDS]
+Time = Annotated[float, Field(strict=True, allow_inf_nan=False, ge=-MAX_TIME_S, le=MAX_TIME_S), AS_SECONDS]
 
 
 def repeat_period(value: str) -> float | None:
@@ -86,7 +87,6 @@ def _repeats(value: str) -> str:
 
 
 Repeats = Annotated[str, AfterValidator(_repeats)]
-Time = Annotated[float, Field(strict=True, allow_inf_nan=False, ge=-MAX_TIME_S, le=MAX_TIME_S)]
 Count = Annotated[int, Field(strict=True, ge=1)]
 
 
@@ -398,7 +398,7 @@ class StuckSection(Section):
 
     readings: Annotated[int, Field(strict=True, ge=2)] | None = None
     """Number of equal measurements in a row from which on the sensor is stuck. Default: by `seconds` or `quantum`."""
-    seconds: Seconds | None = None
+    seconds: Duration | None = None
     """Seconds of equal measurements after which the sensor is stuck. Default: by `readings` or `quantum`."""
     quantum: Positives | None = None
     """Step of the sensor's converter, in its unit; a list gives one a row. Values less than half a step apart are
@@ -419,6 +419,6 @@ class StuckSection(Section):
 class DuplicatesSection(Section):
     """Copies of measurements."""
 
-    within: SomeSeconds
+    within: DurationOrZero
     """Seconds after a measurement within which one of equal values is a copy, for gateways that repeat messages. Below
     the sensor's own period and `time.stale_after`."""

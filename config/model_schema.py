@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Annotated, Any, Union
 from pydantic import BeforeValidator, Discriminator, Field, Tag
 
 from .extensions import schemas
-from .fields import NotNegative, Section, Text, refused
+from .fields import DurationOrZero, Section, Text, refused
 
 
 class MatrixKeysSection(Section):
@@ -32,7 +32,7 @@ class MatricesSection(Section):
     """File of the matrices beside this one: .mat (MATLAB up to v7.2) or .npz (NumPy)."""
     keys: MatrixKeysSection = MatrixKeysSection()
     """Their names in the file. Default: A, B, C, D and dt."""
-    sample_time: NotNegative | None = None
+    sample_time: DurationOrZero | None = None
     """Sample time in seconds, 0 for a continuous model. Default: that of the file, or 0."""
     states: Annotated[dict[Text, Text], Field(min_length=1)]
     """The states in the order of A, with their units: {position: m, speed: m/s}."""

@@ -4,28 +4,23 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING, Annotated, Literal, Union
 
-from pydantic import BeforeValidator, Field, create_model, model_validator
+from pydantic import Field, create_model, model_validator
 
 from .extensions import registered, schemas
 from .fields import (
     Duration,
+    DurationOrZero,
     EnvironmentName,
     Number,
     Positive,
     Section,
     Text,
     Texts,
-    as_seconds,
     one_of,
     refused,
 )
 
 Url = Annotated[str, Field(pattern=r"^(https?://\S+|\$[A-Za-z_][A-Za-z0-9_]*)$")]
-
-DelayOrNone = Annotated[
-    Annotated[float, Field(strict=True, ge=0, le=1e9)], BeforeValidator(as_seconds, json_schema_input_type=float | str)
-]
-"""A duration that may be 0."""
 
 
 class WebhookSection(Section):
@@ -69,13 +64,13 @@ class AlertSection(Section):
     deviation. Default: 0.5, when the mean is beyond; 0.05 warns earlier, 0.95 when it is certain."""
     lost: Duration | None = None
     """Seconds without any event, or in which the fold does not answer, after which there is an alert."""
-    after: DelayOrNone = 1.0
+    after: DurationOrZero = 1.0
     """Seconds for which the condition must last. Default: 1."""
-    clear: DelayOrNone = 10.0
+    clear: DurationOrZero = 10.0
     """Seconds without the condition after which the alert is resolved. Default: 10."""
     repeat: Duration | Literal["never"] = 3600.0
     """Seconds after which an alert that lasts is sent again. Default: 3600."""
-    maintenance: DelayOrNone = 600.0
+    maintenance: DurationOrZero = 600.0
     """Seconds after a maintenance in which nothing is sent. Default: 600."""
     to: Texts | None = None
     """Names of receivers. Default: all."""
@@ -105,7 +100,7 @@ class AlertSection(Section):
 class PublishedSection(Section):
     """How often the state is published, and what of it."""
 
-    every: DelayOrNone = 0.1
+    every: DurationOrZero = 0.1
     """Seconds between two states that are published; 0 publishes after each batch of measurements. Default: 0.1."""
     covariance: Annotated[bool, Field(strict=True)] = False
     """Whether published messages have the covariance of all states. Default: false."""

@@ -12,10 +12,12 @@ from typing import Annotated, Any, ClassVar, Literal
 from pydantic import BeforeValidator, ConfigDict, Field, model_validator
 
 from .fields import (
+    AS_SECONDS,
     MAX_DURATION_S,
     Count,
     DuplicatesSection,
     Duration,
+    DurationOrZero,
     ErrorSection,
     Flag,
     Limited,
@@ -27,9 +29,7 @@ from .fields import (
     Positive,
     Positives,
     Ranges,
-    Seconds,
     Section,
-    SomeSeconds,
     SpreadSection,
     StuckSection,
     Text,
@@ -257,7 +257,7 @@ class GateSection(Section):
     kind: Literal["hard", "soft"] = "hard"
     """hard: a measurement outside is rejected. soft: its noise is inflated until it lies on the gate, so that it moves
     the estimate less the further off it is; kf-steady and `adapt: R` accept no soft gate. Default: hard."""
-    reopen: Seconds | Literal["never"] = 30.0
+    reopen: Duration | Literal["never"] = 30.0
     """Seconds after the first rejected measurement from which a sensor is accepted again if the other sensors cannot
     decide. If they can, a sensor that stays rejected is isolated, or the estimate was wrong and accepts it. never: it
     stays rejected. Default: 30."""
@@ -275,18 +275,18 @@ STALE_RATIO = 4.0
 class TimeSection(Section):
     """Treatment of late and missing measurements."""
 
-    horizon: SomeSeconds = 2.0
+    horizon: DurationOrZero = 2.0
     """Seconds by which a measurement may be late; later ones are counted as stale and dropped. Choose the largest
     expected latency. Default: 2."""
-    degraded_after: Seconds | None = None
+    degraded_after: Duration | None = None
     """Seconds without a used measurement after which health is degraded. Default: the slowest time constant
     of the model at the prior, but at least 3 s and three periods of the slowest sensor (simulated, or the longest that
     a recording keeps four times in succession), and at most stale_after if that is given; `nisus fold` prints where it
     comes from."""
-    stale_after: Seconds = 15.0
+    stale_after: Duration = 15.0
     """Seconds without a used measurement after which health is stale; not below degraded_after. Default: 15, or four
     times a degraded_after that follows from a longer period."""
-    paused_after: Seconds | None = None
+    paused_after: Duration | None = None
     """Seconds without any event, measurement or input, after which the inputs of the pause count as unknown, as where a
     logger was off while the asset ran on: the states that inputs drive become as uncertain as at the start. A gap of
     up to three median periods of the recording is none. Default: never; the last inputs are held."""
@@ -295,9 +295,9 @@ class TimeSection(Section):
     inflate: it is used on arrival, with its variance inflated by the predicted change since; fast, approximate, and not
     for filters with a fixed R. auto: exact, unless one rewind may take longer than late_allowed by the estimate that
     `nisus fold` prints. Default: auto."""
-    late_allowed: Seconds = 0.25
+    late_allowed: Duration = 0.25
     """Seconds that one rewind may take, for late: auto. Default: 0.25."""
-    tick: Annotated[float, Field(strict=True, ge=0.01, le=MAX_DURATION_S)] = 0.5
+    tick: Annotated[float, Field(strict=True, ge=0.01, le=MAX_DURATION_S), AS_SECONDS] = 0.5
     """Seconds without a measurement after which the estimate is predicted and shown. Default: 0.5."""
 
     @model_validator(mode="after")
@@ -392,16 +392,16 @@ class ViewSection(Section):
     pairs: tuple[tuple[Text, Text], ...] | None = None
     """Pairs of states whose joint covariance is drawn as an ellipse. Default: the first two states; of a large field
     none."""
-    window: Seconds = 60.0
+    window: Duration = 60.0
     """Initial time span of the charts, s. Default: 60."""
     speed: Annotated[float, Field(strict=True, gt=0, le=1e9)] = 1.0
     """Speed of a simulation or of the replay of a recording, times real time. The page folds a recording to its end
     first; --speed overrides both. Default: 1."""
-    at: Annotated[float, Field(strict=True, ge=0)] | None = None
+    at: DurationOrZero | None = None
     """Moment at which the cursor stands when the page has folded a recording, s after its start. Default: the end."""
     cells: Annotated[tuple[Text, ...], Field(min_length=1)] | None = None
     """Cells of a large field whose estimate is kept at every event and charted. Default: 16 spread over it."""
-    picture: Seconds | None = None
+    picture: Duration | None = None
     """Seconds of the asset's time between two pictures of a large field. Default: a sixtieth of the window."""
     scene: SceneSection = SceneSection()
     """The three-dimensional scene. Default: the estimate over the first three states."""

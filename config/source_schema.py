@@ -13,13 +13,14 @@ from estimators.errors import nearest
 from .channels import ColumnSection, MessagesSection, SignalSection
 from .extensions import schemas
 from .fields import (
+    AS_SECONDS,
     MAX_DURATION_S,
     Count,
+    Duration,
+    DurationOrZero,
     LevelSection,
     Number,
-    Seconds,
     Section,
-    SomeSeconds,
     SpreadSection,
     Text,
     Texts,
@@ -57,7 +58,7 @@ class SineSection(Section):
     """Mean, in the input's unit. Default: 0."""
     amplitude: Number
     """Amplitude, in the input's unit."""
-    period: Seconds
+    period: Duration
     """Period, s."""
     phase: Number = 0.0
     """Phase at t = 0, rad. Default: 0."""
@@ -68,9 +69,9 @@ class ProfileSection(Section):
 
     constant: Number | None = None
     """A constant, in the input's unit."""
-    steps: Annotated[tuple[tuple[Number, Number], ...], Field(min_length=1)] | None = None
+    steps: Annotated[tuple[tuple[Time, Number], ...], Field(min_length=1)] | None = None
     """[[t, value], ...]: from t seconds on, the value; before the first, the first value."""
-    repeat: Seconds | None = None
+    repeat: Duration | None = None
     """Seconds after which `steps` start again. Default: null, never."""
     sine: SineSection | None = None
     """A sine wave."""
@@ -130,9 +131,9 @@ class AssetSection(Section):
 
     seed: Annotated[int, Field(strict=True, ge=0)] = 0
     """Seed of the noise; the same seed gives the same run. Default: 0."""
-    step: Annotated[float, Field(strict=True, ge=1e-6, le=MAX_DURATION_S)] = 1.0
+    step: Annotated[float, Field(strict=True, ge=1e-6, le=MAX_DURATION_S), AS_SECONDS] = 1.0
     """Seconds between two steps of the simulation. Default: 1."""
-    duration: Seconds | None = None
+    duration: Duration | None = None
     """Seconds after which it ends. Default: null, never."""
     initial: dict[str, Number] = {}
     """True state at the start, by state, in its unit. Default: the prior's mean."""
@@ -328,15 +329,15 @@ class FaultSection(Section):
     """The affected row of the sensor. Default: null, all."""
     other: Text | None = None
     """The sensor with which `sensor` is swapped."""
-    start: SomeSeconds = 0.0
+    start: DurationOrZero = 0.0
     """Start, seconds after the first event. Default: 0."""
-    end: Seconds | None = None
+    end: Duration | None = None
     """End, seconds after the first event. Default: null, never."""
     size: Number | None = None
     """Size: in the unit of the row or input (drift: per second), a factor, or seconds, by kind."""
     rate: Number | None = None
     """Probability for each measurement. Required by spike; otherwise the default is 1."""
-    every: Number | None = None
+    every: DurationOrZero | None = None
     """Seconds: of bursts between two arrivals, of duplicate between two repetitions. Default: of duplicate 0."""
     count: Count | None = None
     """Repetitions of a duplicate. Default: 1."""

@@ -58,6 +58,13 @@ def test_values_are_read_and_defaults_filled_in():
     assert loaded.places.at(("source", "inputs", "torque", 1)) == "folder/motor.yaml:13"
 
 
+def test_every_duration_takes_a_unit():
+    set_to = {"time.tick": "500 ms", "time.stale_after": "2 min", "time.horizon": "0.5 s", "view.window": "1 h"}
+    config = load_text(MOTOR.replace("duration: 120", "duration: 1 d"), Path("motor.yaml"), set_to).config
+    assert (config.time.tick, config.time.stale_after, config.time.horizon) == (0.5, 120.0, 0.5)
+    assert (config.view.window, config.source.duration) == (3600.0, 86400.0)
+
+
 @cases(__file__, "mistakes.csv")
 def test_a_value_that_breaks_a_rule_is_one_line(old, new, expected):
     assert old in MOTOR

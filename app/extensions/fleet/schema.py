@@ -7,8 +7,8 @@ from typing import Annotated, Literal
 from pydantic import Field, model_validator
 
 from app.extensions.mqtt.schema import ASSET_LEVEL, MqttSection, MqttSourceSection
-from config.fields import Count, Duration, Number, Section, Text, Texts, refused
-from config.output_schema import DelayOrNone, ReceiverSection
+from config.fields import Count, Duration, DurationOrZero, Number, Section, Text, Texts, refused
+from config.output_schema import ReceiverSection
 from config.source_schema import PushSection, TableSection
 from estimators.errors import is_blank
 
@@ -64,11 +64,11 @@ class FleetAlertSection(Section):
     """Name of the rule. Default: its condition, as in health-degraded."""
     health: Literal["advisory", "suspect", "degraded", "diverged", "stale"]
     """Health from which on an asset is in alarm: degraded includes diverged and stale."""
-    after: DelayOrNone = 1.0
+    after: DurationOrZero = 1.0
     """Seconds for which an asset must be so. Default: 1."""
-    clear: DelayOrNone = 10.0
+    clear: DurationOrZero = 10.0
     """Seconds of better health after which an asset has recovered. Default: 10."""
-    group: DelayOrNone = 10.0
+    group: DurationOrZero = 10.0
     """Least seconds between two messages; what changes meanwhile is in the next. Default: 10."""
     repeat: Duration | Literal["never"] = 3600.0
     """Seconds after which a message is repeated while assets are in alarm. Default: 3600."""

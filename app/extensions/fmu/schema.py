@@ -7,7 +7,7 @@ from typing import Annotated, Any
 
 from pydantic import BeforeValidator, Field
 
-from config.fields import Seconds, Section, Text
+from config.fields import Duration, Section, Text
 
 
 def variable_name(variable: str) -> str:
@@ -32,7 +32,7 @@ class FmuSection(Section):
 
     fmu: Text
     """The FMU beside this file."""
-    step: Seconds
+    step: Duration
     """Longest step of the integration (Runge-Kutta of fourth order), s. Choose a tenth of the fastest time constant."""
     states: Variables = {}
     """Names of continuous states, {speed: der_pos} or a list of variables. Default: the variables' own names, with

@@ -7,7 +7,7 @@ from typing import Annotated, Any, Literal
 from pydantic import BeforeValidator, Field, model_validator
 
 from config.channels import MessagesSection
-from config.fields import Host, Port, Seconds, Section, Text, refused
+from config.fields import Duration, Host, Port, Section, Text, refused
 
 BIT_TABLES = ("coil", "discrete")
 SIZES = {"int16": 1, "uint16": 1, "int32": 2, "uint32": 2, "int64": 4, "uint64": 4, "float32": 2, "float64": 4}
@@ -53,7 +53,7 @@ class ModbusSourceSection(MessagesSection):
     """Its port. Default: 502."""
     device: Annotated[int, Field(strict=True, ge=0, le=255)] = 1
     """Its number behind a gateway (unit identifier). Default: 1."""
-    every: Seconds = 1.0
+    every: Duration = 1.0
     """Seconds between two readings. Each is a measurement: read no faster than the device measures. Default: 1."""
     registers: Annotated[
         dict[

@@ -7,7 +7,7 @@ from typing import Annotated, Literal
 from pydantic import Field, model_validator
 
 from config.channels import MessagesSection
-from config.fields import EnvironmentName, Host, Port, Seconds, Section, Text, refused
+from config.fields import Duration, EnvironmentName, Host, Port, Section, Text, refused
 
 
 class OpcUaSourceSection(MessagesSection):
@@ -19,7 +19,7 @@ class OpcUaSourceSection(MessagesSection):
     """Address of the server: opc.tcp://plc.local:4840."""
     nodes: Annotated[dict[Text, Text], Field(min_length=1)]
     """Node ids by the names of their values: {LT101: "ns=2;s=Tank.Level"}."""
-    every: Seconds = 0.1
+    every: Duration = 0.1
     """Publishing interval, s. Default: 0.1."""
 
 
