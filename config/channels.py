@@ -47,13 +47,13 @@ class ChannelSection(Section):
     """Factor applied after the unit is converted; -1 turns an axis round. A list gives one a value. Default: 1."""
     offset: Numbers = (0.0,)
     """Added after `scale`, in the model's unit. A list gives one a value. Default: 0."""
-    where: dict[str, Condition] = {}
-    """Conditions {name: value} or {name: {min, max}} on other values of the same row or message; where one fails, the
+    valid_if: dict[str, Condition] = {}
+    """Conditions {name: value} or {name: [low, high]} on other values of the same row or message; where one fails, the
     measurement is missing. Of a table also texts: {quality: Good} or {quality: [Good, Uncertain]}. Default: none."""
     only: dict[str, Condition] = {}
-    """Conditions as in `where` that select the rows or frames of this channel: {anchor: 3}, {tag: TT101}. Others are
+    """Conditions as in `valid_if` that select the rows or frames of this channel: {anchor: 3}, {tag: TT101}. Others are
     ignored, without a missing measurement. Default: none."""
-    by: Text | dict[Text, dict[Text, Condition]] | None = None
+    landmark_column: Text | dict[Text, dict[Text, Condition]] | None = None
     """Column or signal with the landmark of each row, for a sensor with landmarks: landmark_id. If its values are not
     the ids of the sensors SENSOR_ID, also the value of each id: {node_id: {1: 0, 2: 1, 3: 5}}. Rows with other values
     are ignored. Default: none."""
@@ -102,7 +102,7 @@ class SignalSection(ChannelSection):
 
     @model_validator(mode="after")
     def _numbers(self) -> SignalSection:
-        for key in ("where", "only"):
+        for key in ("valid_if", "only"):
             for name, rule in getattr(self, key).items():
                 if rule.text is not None:
                     text = f"compares {name} with the text {rule.text[0]!r}; give the signal's raw number"

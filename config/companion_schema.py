@@ -113,7 +113,7 @@ class TuningSection(Section):
     """Options of other filters, by name."""
     parameters: Parameters = {}
     """Parameters of the model, with the covariance that the fit gives them: std and correlation."""
-    valid: dict[str, Validity] = {}
+    valid_range: dict[str, Validity] = {}
     """Range of the fitted recordings, by state or input, outside which parameters widen."""
     withhold: dict[str, Positive] = {}
     """Half-width of the 95 % band of a state beyond which its estimate is withheld."""

@@ -134,8 +134,7 @@ class Section(BaseModel):
     def _known_keys(cls, data: Any) -> Any:
         # Before pydantic's own check, which reports the stray key but not its neighbours.
         if isinstance(data, dict):
-            # `from` is a word of Python, and so the name of no field.
-            fields = {field.alias or name: field for name, field in cls.model_fields.items()}
+            fields = cls.model_fields
             known = list(fields)
             if cls.free_keys is not None:
                 data = {key: value for key, value in data.items() if not key.startswith(cls.free_keys)}
@@ -161,8 +160,7 @@ class Section(BaseModel):
             for field, text in zip(body, body[1:]):
                 if isinstance(field, ast.AnnAssign) and isinstance(text, ast.Expr):
                     name = field.target.id  # type: ignore[union-attr]
-                    key = cls.model_fields[name].alias or name
-                    described[key]["description"] = inspect.cleandoc(text.value.value)  # type: ignore[attr-defined]
+                    described[name]["description"] = inspect.cleandoc(text.value.value)  # type: ignore[attr-defined]
         return schema
 
 
@@ -175,22 +173,53 @@ def one_of(section: Section, *keys: str, required: bool) -> None:
         raise refused("absent", f"gives neither {' nor '.join(keys)}")
 
 
+Pair = tuple[Number | None, Number | None]
+
+
+def as_pair(value: Any) -> Any:
+    """Refuse a list that is no pair."""
+    if isinstance(value, (list, tuple)) and len(value) != 2:
+        raise refused("value", "give the least and the greatest value, null for none")
+    return value
+
+
+def _rising(pair: Pair) -> Pair:
+    low, high = pair
+    if low is not None and high is not None and not low < high:
+        raise refused("value", "the first must be below the second")
+    return pair
+
+
+Interval = Annotated[Pair, BeforeValidator(as_pair, json_schema_input_type=Pair), AfterValidator(_rising)]
+"""The least and the greatest value, [20, 38]; null for none."""
+
+
+def _not_negative(pair: Pair) -> Pair:
+    if min(end for end in (*pair, 0.0) if end is not None) < 0.0:
+        raise refused("value", "its ends must not be negative")
+    return pair
+
+
 class BoundedSection(Section):
     """A value and its range by the data sheet, within which a fit (`nisus tune`) stays."""
 
     value: NotNegatives
     """The value; a list gives one a row."""
-    low: NotNegative = Field(0.0, alias="from")
-    """Smallest admissible value. Default: 0."""
-    to: Positive = LARGEST
-    """Largest admissible value. Default: no bound."""
+    range: Annotated[Interval, AfterValidator(_not_negative)]
+    """Smallest and largest admissible value, [0.3, 0.8]; null for none."""
+
+    @property
+    def ends(self) -> tuple[float, float]:
+        """The two ends of the range."""
+        low, high = self.range
+        return low or 0.0, LARGEST if high is None else high
 
     @model_validator(mode="after")
     def _inside(self) -> BoundedSection:
+        low, high = self.ends
         for value in self.value:
-            if not self.low <= value <= self.to:
-                text = f"is {value:g}; it must lie between from ({self.low:g}) and to ({self.to:g})"
-                raise refused("relation", text, "value")
+            if not low <= value <= high:
+                raise refused("relation", f"is {value:g}; it must lie in its range ({low:g} to {high:g})", "value")
         return self
 
 
@@ -210,7 +239,7 @@ class LevelSection(Section):
     """Strength of a process noise: the variance or standard deviation that one second adds. Give one of the two."""
 
     variance: Level | None = None
-    """Variance added in one second, in the square of the state's unit for the usual additive noise. {value, from, to}
+    """Variance added in one second, in the square of the state's unit for the usual additive noise. {value, range}
     also gives the range within which a fit stays."""
     std: Level | None = None
     """Its square root: the standard deviation after one second. As `variance`."""
@@ -240,7 +269,7 @@ class LevelSection(Section):
 class NoiseSection(LevelSection):
     """Strength and correlation time of a process noise."""
 
-    over: Duration | None = None
+    correlation_time: Duration | None = None
     """Correlation time of the disturbance, in seconds or with a unit: 120, 2 min. A state
     NAME_disturbance and a parameter NAME_disturbance_time are appended; in the long run the disturbance adds the same
     `variance` a second as white noise. Default: none, white noise."""
@@ -253,7 +282,7 @@ class ErrorSection(Section):
     """Variance of the error, in the square of the sensor's unit; a list gives one a row."""
     std: Positives | None = None
     """Its square root: standard deviation, in the sensor's unit; a list gives one a row."""
-    over: Duration
+    correlation_time: Duration
     """Correlation time of the error, in seconds or with a unit: 300, 5 min."""
 
     @model_validator(mode="after")
@@ -272,10 +301,10 @@ class SpreadSection(Section):
 
     variance: Spread | None = None
     """Variance of the noise, in the square of the sensor's unit; a list gives one a row. 0 is a sensor without noise,
-    which kf, ekf, iekf and the square-root filters take. {value, from, to} also gives the range of the data sheet,
+    which kf, ekf, iekf and the square-root filters take. {value, range} also gives the range of the data sheet,
     within which a fit stays. Default: the model's."""
     std: Spread | None = None
-    """Its square root: standard deviation, in the sensor's unit, as {value: 0.5, from: 0.3, to: 0.8}; a list gives one
+    """Its square root: standard deviation, in the sensor's unit, as {value: 0.5, range: [0.3, 0.8]}; a list gives one
     a row. As `variance`. Default: the model's."""
 
     @model_validator(mode="after")
@@ -304,84 +333,65 @@ def _values(given: float | tuple[float, ...] | BoundedSection) -> tuple[float, .
 
 def _bounds(variance: Any, std: Any) -> tuple[float, float] | None:
     if isinstance(variance, BoundedSection):
-        return variance.low, variance.to
-    return (std.low**2, min(std.to**2, LARGEST)) if isinstance(std, BoundedSection) else None
+        return variance.ends
+    return (std.ends[0] ** 2, min(std.ends[1] ** 2, LARGEST)) if isinstance(std, BoundedSection) else None
 
 
-class RangeSection(Section):
-    """A range of values, its ends included."""
-
-    min: Number | None = None
-    """Lowest value. Default: no limit."""
-    max: Number | None = None
-    """Highest value. Default: no limit."""
-
-
-class ConditionSection(RangeSection):
+class ConditionSection(Section):
     """A range of values, its ends included, or texts of which a column must hold one."""
 
+    range: Pair = (None, None)
+    """Lowest and highest value, null for none. Default: any."""
     text: Texts | None = None
     """Text, or a list of texts. Default: null, the column holds numbers."""
 
 
 def _condition(value: Any) -> Any:
-    if isinstance(value, (str, list)):
-        return {"text": value}
     if isinstance(value, bool):
         value = int(value)
-    return {"min": value, "max": value} if isinstance(value, (int, float)) else value
+    if isinstance(value, (int, float)):
+        value = [value, value]
+    if isinstance(value, list) and not any(isinstance(item, str) for item in value):
+        return {"range": value}
+    return {"text": value} if isinstance(value, (str, list)) else value
 
 
 Condition = Annotated[
     ConditionSection,
-    BeforeValidator(_condition, json_schema_input_type=float | bool | str | list[str] | ConditionSection),
+    BeforeValidator(_condition, json_schema_input_type=float | bool | str | Pair | list[str] | ConditionSection),
 ]
-
-
-Pair = tuple[Number | None, Number | None]
 
 
 def _as_pairs(value: Any) -> Any:
     """Return a single pair as a list of one."""
     if not isinstance(value, (list, tuple)) or any(isinstance(item, (list, tuple)) for item in value):
         return value
-    if len(value) != 2:
-        raise refused("value", "give the least and the greatest value, null for none")
-    return [value]
-
-
-def _rising(pairs: tuple[Pair, ...]) -> tuple[Pair, ...]:
-    for low, high in pairs:
-        if low is not None and high is not None and not low < high:
-            raise refused("value", "the first must be below the second")
-    return pairs
-
-
-def _holds_something(given: RangeSection) -> RangeSection:
-    if given.min is None and given.max is None:
-        raise refused("absent", "gives neither min nor max")
-    if given.min is not None and given.max is not None and not given.min < given.max:
-        raise refused("value", f"its min ({given.min:g}) must be below its max ({given.max:g})")
-    return given
+    return [as_pair(value)]
 
 
 Ranges = Annotated[
-    tuple[Pair, ...],
+    tuple[Interval, ...],
     Field(min_length=1),
     BeforeValidator(_as_pairs, json_schema_input_type=Pair | list[Pair]),
-    AfterValidator(_rising),
 ]
-Limited = Annotated[RangeSection, AfterValidator(_holds_something)]
 
 
-class ValiditySection(RangeSection):
+class ValiditySection(Section):
     """A range of validity, its ends included."""
 
+    range: Interval
+    """Lowest and highest value, null for none."""
     extrapolate: Positive | None = None
     """Distance by which the model holds beyond the range. Default: 5 % of its width."""
 
 
-Validity = Annotated[ValiditySection, AfterValidator(_holds_something)]
+Validity = Annotated[
+    ValiditySection,
+    BeforeValidator(
+        lambda value: {"range": value} if isinstance(value, list) else value,
+        json_schema_input_type=Pair | ValiditySection,
+    ),
+]
 
 
 def bounds(pair: Pair, own: tuple[float, float] | None = None) -> tuple[float, float]:

@@ -13,6 +13,7 @@ from pydantic import ValidationError
 from estimators.errors import ConfigError, nearest
 
 from .model_schema import kind_of
+from .old_names import read_yaml, tell_older
 from .problems import report, shown
 from .schema import ParameterSection, TwinSection, as_gate
 from .tunings import Version, find_version, keep_options, overlay
@@ -75,7 +76,9 @@ def load(name: str | os.PathLike[str], overrides: Mapping[str, str] | None = Non
     given = dict(overrides or {})
     reference = given.pop("tuning", None)
     version = None if reference is None else find_version(path, reference)
-    return load_text(text, path, given, version)
+    loaded = load_text(text, path, given, version)
+    tell_older(loaded.places)
+    return loaded
 
 
 def load_text(
@@ -89,7 +92,7 @@ def load_text(
         ConfigError: With a line for each of the first problems.
     """
     file = shown_path(path)
-    data, places = parse(text, file)
+    text, data, places = read_yaml(text, file)
     if data is None:
         raise ConfigError(f"{file}:1: the file is empty; a twin needs at least model and source")
     if not isinstance(data, dict):
@@ -165,8 +168,8 @@ def _paths_of(data: Any, there: Callable[[str], str], folder: Path) -> Iterator[
         yield ("model", kind), there(model[kind])
     else:
         yield ("model",), file_of(model)
-    if data.get("learned") is not None:
-        yield ("learned",), there(data["learned"])
+    if data.get("correction") is not None:
+        yield ("correction",), there(data["correction"])
     yield from of_source(data.get("source"), ("source",))
 
 
@@ -177,11 +180,11 @@ def _name(path: Path) -> str:
 def _override(data: dict[str, Any], places: ValuePlaces, dotted_key: str, text: str) -> None:
     """Put one command-line value where it belongs; the schema judges the result."""
     option = f"--set {dotted_key}={text}"
+    parts = dotted_key.split(".")
     try:
         value, _ = parse(text, option)
     except ConfigError:
         raise ConfigError(f"{option}: the value is not valid YAML; put brackets and colons in quotes") from None
-    parts = dotted_key.split(".")
     if parts[0] == "estimator" and len(parts) > 1 and isinstance(data.get("estimator"), str):
         data["estimator"] = {"name": data["estimator"]}
     if parts[0] == "gate" and len(parts) > 1:

@@ -12,9 +12,10 @@ from pydantic_core import ErrorDetails
 from estimators.errors import ConfigError, nearest
 
 from .extensions import left_out
+from .old_names import read_yaml
 from .output_schema import ReceiverSection
 from .source_schema import PartSection, SourceSection
-from .yaml_files import Key, ValuePlaces, dotted, parse, shown_path
+from .yaml_files import Key, ValuePlaces, dotted, shown_path
 
 MAX_PROBLEMS = 5  # Problems shown at once
 MAX_SHOWN_ITEMS = 40  # Characters up to which a list or mapping is shown in full
@@ -51,7 +52,7 @@ def check_section(kind: type[S], text: str, path: Path, rule: str) -> tuple[S, d
         ConfigError: With a line for each of the first problems.
     """
     file = shown_path(path)
-    data, places = parse(text, file)
+    _, data, places = read_yaml(text, file)
     if not isinstance(data, dict):
         raise ConfigError(f"{file}:1: the file is {shown(data)}; {rule}")
     try:

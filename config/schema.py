@@ -20,7 +20,7 @@ from .fields import (
     DurationOrZero,
     ErrorSection,
     Flag,
-    Limited,
+    Interval,
     NoiseSection,
     NotNegative,
     Number,
@@ -98,7 +98,7 @@ class ParameterSection(Section):
     """Correlation of its deviation with those of other considered parameters, by name; a pair is given once, under
     either. Default: 0."""
     widen: dict[str, WidenSection] = {}
-    """Growth of its uncertainty outside the fitted range (`valid`) of states and inputs, by their names, as in
+    """Growth of its uncertainty outside the fitted range (`valid_range`) of states and inputs, by their names, as in
     {temperature: {per: 10, by: 50 %}}. Default: none."""
     use: Literal["held", "considered", "estimated"] = "considered"
     """held: the filter takes it for certain. considered: no measurement changes it, and its uncertainty is part of the
@@ -213,7 +213,7 @@ class SensorSection(SpreadSection, InstrumentSection):
     Default: steadily, or as the model says."""
     duplicates: DuplicatesSection | None = None
     """When a measurement of equal values is a copy, which counts once. Default: if its time is equal too."""
-    at: dict[Text, Numbers] | None = None
+    landmarks: dict[Text, Numbers] | None = None
     """Landmarks of a sensor whose model declares a `place`: their coordinates by id, {6: [1.9, -5.6], 7: [1.8, -2.4]}.
     Each becomes a sensor SENSOR_ID with parameters such as SENSOR_6_east; all share this section. Default: none."""
     use: Flag = True
@@ -275,7 +275,7 @@ STALE_RATIO = 4.0
 class TimeSection(Section):
     """Treatment of late and missing measurements."""
 
-    horizon: DurationOrZero = 2.0
+    max_delay: DurationOrZero = 2.0
     """Seconds by which a measurement may be late; later ones are counted as stale and dropped. Choose the largest
     expected latency. Default: 2."""
     degraded_after: Duration | None = None
@@ -291,13 +291,13 @@ class TimeSection(Section):
     logger was off while the asset ran on: the states that inputs drive become as uncertain as at the start. A gap of
     up to three median periods of the recording is none. Default: never; the last inputs are held."""
     late: Literal["exact", "inflate", "auto"] = "auto"
-    """Treatment of a late measurement within the horizon. exact: it is inserted at its time and the filter rewinds.
+    """Treatment of a late measurement within `max_delay`. exact: it is inserted at its time and the filter rewinds.
     inflate: it is used on arrival, with its variance inflated by the predicted change since; fast, approximate, and not
     for filters with a fixed R. auto: exact, unless one rewind may take longer than late_allowed by the estimate that
     `nisus fold` prints. Default: auto."""
     late_allowed: Duration = 0.25
     """Seconds that one rewind may take, for late: auto. Default: 0.25."""
-    tick: Annotated[float, Field(strict=True, ge=0.01, le=MAX_DURATION_S), AS_SECONDS] = 0.5
+    predict_every: Annotated[float, Field(strict=True, ge=0.01, le=MAX_DURATION_S), AS_SECONDS] = 0.5
     """Seconds without a measurement after which the estimate is predicted and shown. Default: 0.5."""
 
     @model_validator(mode="after")
@@ -397,7 +397,7 @@ class ViewSection(Section):
     speed: Annotated[float, Field(strict=True, gt=0, le=1e9)] = 1.0
     """Speed of a simulation or of the replay of a recording, times real time. The page folds a recording to its end
     first; --speed overrides both. Default: 1."""
-    at: DurationOrZero | None = None
+    cursor: DurationOrZero | None = None
     """Moment at which the cursor stands when the page has folded a recording, s after its start. Default: the end."""
     cells: Annotated[tuple[Text, ...], Field(min_length=1)] | None = None
     """Cells of a large field whose estimate is kept at every event and charted. Default: 16 spread over it."""
@@ -441,7 +441,7 @@ class TwinSection(Section):
     parameters: Parameters = {}
     """The model's parameters by name: their values, in their units, or {value, std, correlation, widen, use}. Default:
     the model's values, held."""
-    learned: Text | None = None
+    correction: Text | None = None
     """File of a learned correction, beside this one, as `nisus learn` writes it: a correction of the model's rates,
     with a noise NAME_learned for each corrected state. Default: none, the model alone."""
     estimate: dict[str, EstimateSection] = {}
@@ -459,14 +459,14 @@ class TwinSection(Section):
     inputs: dict[str, InstrumentSection] = {}
     """Offsets and scales of inputs: the model takes scale·u + offset, as in {current: {offset: {std: 0.02}}}. Default:
     none."""
-    valid: dict[str, Validity] = {}
+    valid_range: dict[str, Validity] = {}
     """Range over which the model was fitted or validated, by state or input, in its unit, for example
-    {temperature: {min: 20, max: 38}}. Outside it, by more than `extrapolate`, health is suspect. A fitted
+    {temperature: [20, 38]}. Outside it, by more than `extrapolate`, health is suspect. A fitted
     tuning version has the range of its recordings. An end that is not given is the model's. Default: the model's."""
-    possible: dict[str, Limited] = {}
-    """Physical limits of a state or an estimated parameter, in its unit, for example {level: {min: 0, max: 2.4}}. While
+    possible: dict[str, Interval] = {}
+    """Physical limits of a state or an estimated parameter, in its unit, for example {level: [0, 2.4]}. While
     the band of its estimate lies beyond, health is suspect; a forecast ends there. The prior's mean lies within, and so
-    does some of the range in `valid`. An end that is not given is the model's. Default: the model's; kelvins and
+    does some of the range in `valid_range`. An end that is not given is the model's. Default: the model's; kelvins and
     kilograms are at least 0, unless the prior's mean is within 2 standard deviations of it."""
     withhold: dict[str, Positive] = {}
     """Half-width of the 95 % band of a state beyond which its estimate is withheld, in its unit, for example

@@ -12,6 +12,7 @@ from typing import Any
 from estimators.errors import ConfigError, nearest
 
 from .companion_schema import TuningSection, VersionSection
+from .old_names import tell_older
 from .problems import check_section
 from .yaml_files import TWINS, Key, ValuePlaces, read_text, shown_path
 
@@ -94,7 +95,9 @@ def load_version(path: Path) -> Version:
     Raises:
         ConfigError: With a line for each of the first problems.
     """
-    return version_of(path.stem, read_text(path, "nisus tunings TWIN"), path)
+    version = version_of(path.stem, read_text(path, "nisus tunings TWIN"), path)
+    tell_older(version.places)
+    return version
 
 
 def version_of(name: str, text: str, path: Path) -> Version:

@@ -4,12 +4,10 @@ from __future__ import annotations
 
 import json
 import re
-import shutil
 from collections import Counter
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Iterator, Mapping
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass, field
-from itertools import count
 from pathlib import Path
 from typing import Any
 
@@ -72,6 +70,8 @@ class ValuePlaces:
     file: str
     lines: dict[Key, int] = field(default_factory=dict)
     options: dict[Key, str] = field(default_factory=dict)
+    older: list[str] = field(default_factory=list)
+    """What has names of an earlier version; see `old_names`."""
 
     def at(self, key: Key) -> str:
         """Return the place of `key`, or of the nearest section around it that the file has."""
@@ -98,7 +98,7 @@ def parse(text: str, file: str) -> tuple[Any, ValuePlaces]:
     """
     places = ValuePlaces(file)
     try:
-        node = _composed(text)
+        node = composed(text)
     except yaml.reader.ReaderError as error:
         line = text.count("\n", 0, error.position) + 1
         raise ConfigError(f"{file}:{line}: the character {chr(error.character)!r} is not text; remove it") from None
@@ -116,7 +116,7 @@ def parse(text: str, file: str) -> tuple[Any, ValuePlaces]:
     return _Builder(places).value(node, (), ()), places
 
 
-def _composed(text: str) -> yaml.Node | None:
+def composed(text: str) -> yaml.Node | None:
     """Return the nodes of a YAML text; of a wrong one, PyYAML describes the error better than libyaml."""
     with suppress(yaml.YAMLError):
         return yaml.compose(text, Loader=_QuickLoader)
@@ -272,29 +272,6 @@ def writing(path: Path, option: str = "") -> Iterator[None]:
         ) from None
 
 
-def rewrite(path: Path, change: Callable[[str], str], out: Path | None = None) -> Path | None:
-    """Write the changed text of a YAML file to `out`, or over itself.
-
-    Returns:
-        The copy of the file as it was, beside it; None where `out` was written.
-
-    Raises:
-        ConfigError: If it cannot be written.
-    """
-    with writing(out or path):
-        with path.open(encoding="utf-8", newline="") as file:
-            text = file.read()
-        end = "\r\n" if "\r\n" in text else "\n"
-        changed = change(text.replace("\r\n", "\n")).replace("\n", end)
-        kept = None
-        if out is None:
-            numbers = (path.with_name(f"{path.name}.{k}.bak") for k in count(1))
-            kept = next(copy for copy in numbers if not copy.exists())
-            shutil.copy2(path, kept)
-        (out or path).write_text(changed, encoding="utf-8", newline="")
-    return kept
-
-
 def with_section(text: str, key: str, section: str) -> str:
     """Return a YAML text in which the section `key` has these lines; without one, they are appended."""
     # The key and the lines under it, to the last that is indented; a comment after that belongs to what follows.
@@ -311,7 +288,7 @@ def with_values(text: str, values: Mapping[Key, Any]) -> tuple[str, list[Key]]:
     A value that an alias shares with another key counts as one that it does not have. A mapping replaces any value, and
     is the first entry of its section where that has no such key.
     """
-    root = _composed(text)
+    root = composed(text)
     places = Counter(map(id, _nodes(root)))
     edits: list[tuple[int, int, str]] = []
     missing: list[Key] = []
@@ -330,7 +307,7 @@ def with_values(text: str, values: Mapping[Key, Any]) -> tuple[str, list[Key]]:
         if shared:
             missing.append(key)
         elif isinstance(value, Mapping) and name is not None:
-            edits.append((name.end_mark.index, _end(node), f": {written}"))
+            edits.append((name.end_mark.index, end_of(node), f": {written}"))
         elif isinstance(value, Mapping) and isinstance(section, yaml.MappingNode) and section.value and head:
             first, line = section.value[0][0].start_mark, f"{_key(str(part))}: {written}"
             if section.flow_style:
@@ -347,7 +324,7 @@ def with_values(text: str, values: Mapping[Key, Any]) -> tuple[str, list[Key]]:
     return text, missing
 
 
-def _end(node: Any) -> int:
+def end_of(node: Any) -> int:
     """Return the index after a node; PyYAML ends one in block style after the comments that follow."""
     while isinstance(node, yaml.CollectionNode) and not node.flow_style:
         node = node.value[-1][1] if isinstance(node, yaml.MappingNode) else node.value[-1]

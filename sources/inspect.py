@@ -508,9 +508,9 @@ def quality_conditions(found: RecordingContents) -> list[str]:
     for one in found.columns:
         if QUALITY.search(one.name) and one.values.size and 0 <= one.values.min() < OPC_GOOD <= one.values.max() < 256:
             below = int(np.sum(one.values < OPC_GOOD))
-            lines.append((one.name, f"below {OPC_GOOD}", below, {"min": OPC_GOOD}))
+            lines.append((one.name, f"below {OPC_GOOD}", below, [OPC_GOOD, None]))
     return [
-        f"{name} is {what} (rows: {count}); to leave these rows out give where: "
+        f"{name} is {what} (rows: {count}); to leave these rows out give valid_if: "
         + json.dumps({name: good}, ensure_ascii=False)
         for name, what, count, good in lines
     ]

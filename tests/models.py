@@ -151,7 +151,7 @@ def write_plant(folder: Path, count: int, *, family: bool, seconds: int = 20, bi
     (folder / "plant.csv").write_text("\n".join(["t," + ",".join(f"TT{name}" for name in names), *table]) + "\n")
     lines = [f"model: ./plant.py:{'Family' if family else 'Each'}", "estimator: kf", "gate: 0.9999", "sensors:"]
     if family:
-        lines += ["  TT:", "    std: 0.5", "    at:"]
+        lines += ["  TT:", "    std: 0.5", "    landmarks:"]
         lines += [f"      {name}: [{z}, {g}, {o}]" for name, (z, g, o) in zip(names, channels, strict=True)]
     else:
         lines += [f"  TT{name}: {{std: 0.5}}" for name in names]

@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from config.loader import moved, shipped
-from config.yaml_files import rewrite
+from config.old_names import rewrite
 from estimators.errors import ConfigError
 from estimators.log import READING, Log
 from sources.formats import is_whole

@@ -490,6 +490,21 @@ class NewCommand(JsonOption, RoleOptions, TableOptions):
     """Recordings whose signals become sensors."""
 
 
+@dataclass(frozen=True)
+class MigrateCommand(JsonOption):
+    """Rewrite twins, fleets and tuning versions by the names of this version; comments stay.
+
+    Of a twin its tuning versions too. The file as it was is kept beside it, as FILE.yaml.1.bak.
+
+    Examples:
+      nisus migrate drive.yaml
+      nisus migrate plant/*.yaml
+    """
+
+    files: Annotated[tuple[str, ...], tyro.conf.Positional]
+    """YAML files."""
+
+
 COMMANDS: dict[type, str] = {
     RunCommand: "run:run_twin",
     FoldCommand: "fold:fold_twin",
@@ -503,6 +518,7 @@ COMMANDS: dict[type, str] = {
     ReviewCommand: "run:review_recording",
     TwinsCommand: "twins:show_twins",
     TuningsCommand: "tunings:tunings_of",
+    MigrateCommand: "migrate:migrate",
     SchemaCommand: "new:write_schema",
     LogCommand: "log:show_log",
     NewCommand: "new:new_twin",

@@ -125,7 +125,7 @@ def _topic(found: RecordingContents) -> Topic:
             for name, counts in found.texts.items()
         ]
         if found.by:
-            texts.append(f"{found.by} names the source of each row; a twin reads them with by: {found.by}")
+            texts.append(f"{found.by} names the source of each row; a twin reads them with landmark_column: {found.by}")
         texts += quality_conditions(found)
         return Topic(title, (*sentences, f"time: column {found.time.label}{zone}", *texts), ("column", *TIMES), rows)
     lines: list[tuple[Cell, ...]] = []

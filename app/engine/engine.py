@@ -110,10 +110,10 @@ class Engine(Running):
         self._gesture = ""
         """Gesture of the edit that asked for the present settings."""
         section = twin.config.time
-        allowed = section.horizon if horizon is None else horizon
+        allowed = section.max_delay if horizon is None else horizon
         self._horizon = round(allowed * 1e9) if np.isfinite(allowed) else None
         self._first_base = base
-        self._tick = section.tick
+        self._tick = section.predict_every
         self._last_options: dict[str, Mapping[str, float]] = {}
         self._workshop.report = lambda text: self.notices.say(text, level="warn")
         if self.twin.forced_baseline:
@@ -136,7 +136,7 @@ class Engine(Running):
         self.reloads = 0
         self._stopping = threading.Event()
         self._finished = False
-        self._idle_ticks = IdleTicks(section.tick)
+        self._idle_ticks = IdleTicks(section.predict_every)
         self._prompt: int | None = None
         """Time of the newest event when measurements were last used in time, ns."""
         self.jobs = Jobs(self.notices)

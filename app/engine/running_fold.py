@@ -280,7 +280,7 @@ class Running(ABC):
         """
         with self._reading():
             log, n = self._log, self._fold.n
-            oldest = log.newest - round(self.twin.config.time.horizon * 1e9)
+            oldest = log.newest - round(self.twin.config.time.max_delay * 1e9)
             return log.first + max(int(np.searchsorted(log.t[:n], oldest)), n - self.history // 2)
 
     def span(self) -> tuple[int, int]:

@@ -375,7 +375,9 @@ def _stored_twin(
     if base is not None:
         check_base(base, twin.model)
     Log.resume(twin.model, base, events)
-    same_source = state["source"] == source_text(twin)
+    # Of a store of the version before the files stand in a pair, beside the section.
+    files = repr(twin.plan.log_files)
+    same_source = before.config.source == twin.config.source and state["source"].endswith((files, f", {files})"))
     tail = LogTail(
         fresh=True,
         first=state["oldest"],
@@ -415,11 +417,6 @@ def _check_integers(items: list[Any]) -> None:
             _check_integers(item)
         else:
             int(item)
-
-
-def source_text(twin: Twin) -> str:
-    """Return the description of a twin's source, of which the count of events is."""
-    return repr((twin.config.source, twin.plan.log_files))
 
 
 _RUN_FIELDS = ("number", "began", "loaded", "name", "note", "place", "why", "first", "gesture")
@@ -540,7 +537,7 @@ class StoreWriter:
         if not (changed or commands or len(tail.events) or tail.fresh or closed):
             return
         state = {name: getattr(tail, name) for name in ("oldest", "end", "floor", "taken", "intake")}
-        state |= {"source": source_text(twin), "written": time.time(), "closed": closed}
+        state |= {"source": repr(twin.plan.log_files), "written": time.time(), "closed": closed}
         self._store.write(tail, changed | {"state": json.dumps(state, default=_plain)}, commands)
         self._written = {name: of for name, (of, _) in now.items()} | {"numbers": None}
         self._mark = tail.mark

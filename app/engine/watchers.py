@@ -36,7 +36,7 @@ class Watchers:
         section, notices = engine.twin.config.time, engine.notices
         self._jobs, self._monitors, self._notices = engine.jobs, engine.monitors, notices
         self.latency = Latency()
-        self.clock = HostClock(notices, section.horizon)
+        self.clock = HostClock(notices, section.max_delay)
         self.dropped = DroppedShare()
         self.repeats = RepeatedValues(engine)
         self.episode_log = EpisodeLog(engine, others=lambda: (*self.dropped.entries, *self.repeats.entries))

@@ -285,7 +285,7 @@ def figures(checked: Checked, checklist: Sequence[ChecklistLine]) -> dict[str, A
             },
             "timing": {
                 "stamps": stamps(twin),
-                "horizon": twin.config.time.horizon,
+                "horizon": twin.config.time.max_delay,
                 "degraded_after": policy.degraded_after,
                 "stale_after": policy.stale_after,
                 "stale": checked.counts["stale"],
@@ -326,7 +326,7 @@ def topics(checked: Checked, checklist: Sequence[ChecklistLine]) -> list[Topic]:
     asked = [
         f"valid.{state.name} leaves out the prior's mean, {state.mean:g}{spaced(state.unit)}: is it in that unit?"
         for state in twin.model.shown_states
-        if state.name in twin.config.valid and state.fitted and is_outside(state, state.mean)
+        if state.name in twin.config.valid_range and state.fitted and is_outside(state, state.mean)
     ]
     return [
         Topic(f"{twin.name}: {twin.title}", (head, *asked)),

@@ -128,7 +128,7 @@ def _observability(checked: Checked) -> Answer:
 
 
 def _timing(checked: Checked) -> Answer:
-    horizon, policy = checked.twin.config.time.horizon, checked.twin.policy
+    horizon, policy = checked.twin.config.time.max_delay, checked.twin.policy
     reporting = [item for item in checked.arrivals if item.n]
     late = [item.lateness[-1] for item in reporting if np.isfinite(item.lateness[-1])]
     by_chance = {sensor.name for sensor in checked.twin.model.sensors if sensor.by_chance}
@@ -148,7 +148,7 @@ def _timing(checked: Checked) -> Answer:
     if absent:
         said.append(f"never reported: {', '.join(absent)}")
     if stale:
-        remedy = f"{stale} reading(s) came later than the horizon: raise time.horizon"
+        remedy = f"{stale} reading(s) came later than the horizon: raise time.max_delay"
     elif absent:
         remedy = "check the channel map of the sensors that never reported"
     elif worst is not None and worst.gap > policy.degraded_after:

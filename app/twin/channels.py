@@ -7,7 +7,7 @@ from math import inf
 from typing import TYPE_CHECKING, Any
 
 from config.channels import ChannelSection, SignalSection
-from config.fields import ConditionSection, repeat_period
+from config.fields import ConditionSection, bounds, repeat_period
 from config.loader import Loaded
 from config.source_schema import FaultSection
 from config.yaml_files import Key
@@ -93,7 +93,7 @@ def channel_of(
         model_units=tuple(unit for _, unit in rows),
         scale=item.scale,
         offset=item.offset,
-        where=_conditions(item.where),
+        where=_conditions(item.valid_if),
         only=_conditions(item.only),
         convert=item.convert,
         origin=item.origin,
@@ -109,8 +109,7 @@ def _conditions(given: Mapping[str, ConditionSection]) -> tuple[Condition, ...]:
     found = []
     for signal, rule in given.items():
         if rule.text is None:
-            low, high = -inf if rule.min is None else rule.min, inf if rule.max is None else rule.max
-            found.append(Condition(signal, low, high))
+            found.append(Condition(signal, *bounds(rule.range)))
         else:
             found.append(Condition(TextMatch(signal, rule.text), 1.0, 1.0))
     return tuple(found)

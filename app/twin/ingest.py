@@ -206,7 +206,7 @@ def dropped_episode(start: float, lost: int, taken: int) -> Episode:
     """Return the episode of so many lost measurements of all that were taken since `start`, s."""
     text = (
         f"{100 * lost / taken:.3g} % of the measurements were dropped, {lost} of {taken}: too late, or with impossible "
-        "times; check the times of the source, or lengthen time.horizon"
+        "times; check the times of the source, or lengthen time.max_delay"
     )
     return Episode(start, None, "twin", "dropped", lost / taken, math.nan, math.nan, "", text)
 

@@ -15,14 +15,17 @@ from estimators.errors import ModelError
 from estimators.model.landmarks import missing, with_landmarks
 from estimators.model.state_space import StateSpaceModel
 
+COLUMN = "landmark_column"
+
 
 def expanded(model: StateSpaceModel, loaded: Loaded) -> tuple[StateSpaceModel, Loaded]:
     """Return a model with a sensor for each landmark, and the configuration of these.
 
     Raises:
-        ConfigError: With file and line, if landmarks are missing or do not fit, or `by` is missing or misplaced.
+        ConfigError: With file and line, if landmarks are missing or do not fit, or the column of a sensor's is.
     """
-    given = {name: section.at for name, section in loaded.config.sensors.items() if section.at is not None}
+    sections = loaded.config.sensors.items()
+    given = {name: section.landmarks for name, section in sections if section.landmarks is not None}
     for sensor in model.sensors:
         if sensor.place and sensor.name not in given:
             raise loaded.error(("sensors", sensor.name), missing(model, sensor).partition(f"{sensor.name} ")[2])
@@ -30,7 +33,7 @@ def expanded(model: StateSpaceModel, loaded: Loaded) -> tuple[StateSpaceModel, L
         try:
             model = with_landmarks(model, given)
         except ModelError as error:
-            raise loaded.error(("sensors", next(iter(given)), "at"), f"does not fit: {error}") from None
+            raise loaded.error(("sensors", next(iter(given)), "landmarks"), f"does not fit: {error}") from None
     members: dict[str, list[str]] = {}
     for sensor in model.sensors:
         if sensor.family:
@@ -40,10 +43,10 @@ def expanded(model: StateSpaceModel, loaded: Loaded) -> tuple[StateSpaceModel, L
     for family, names in members.items():
         if family in sensors:
             section = sensors.pop(family)
-            common = section.model_copy(update={"at": None})
+            common = section.model_copy(update={"landmarks": None})
             sensors |= {name: _merged(common, sensors.get(name)) for name in names}
-            if section.at is not None:  # stays for a YAML that is written from this one
-                sensors[family] = SensorSection(at=section.at)
+            if section.landmarks is not None:  # stays for a YAML that is written from this one
+                sensors[family] = SensorSection(landmarks=section.landmarks)
     source = _of_source(loaded, ("source",), config.source, members)
     scene = config.view.scene
     beacons = dict(scene.beacons)
@@ -78,14 +81,14 @@ def _of_source(loaded: Loaded, key: Key, section: Any, members: Mapping[str, lis
     sensors = dict(getattr(section, "sensors", {}))
     for name, item in list(sensors.items()):
         place = (*key, "sensors", name)
-        by = getattr(item, "by", None)
+        by = getattr(item, COLUMN, None)
         if name not in members:
             if by is not None:
-                raise loaded.error((*place, "by"), f"is for a sensor with landmarks, and {name} has none; use only")
+                raise loaded.error((*place, COLUMN), f"is for a sensor with landmarks, and {name} has none; use only")
             continue
         apart = isinstance(item, ChannelSection) and all("*" in column for column in item.names())
         if isinstance(item, ChannelSection) and by is None and not apart:
-            rule = "name the column that tells them apart, by: COLUMN, or columns of their own with * for the id"
+            rule = f"name the column that tells them apart, {COLUMN}: NAME, or columns of their own with * for the id"
             raise loaded.error(place, f"has landmarks; {rule}")
         del sensors[name]
         if by is not None:
@@ -97,8 +100,8 @@ def _of_source(loaded: Loaded, key: Key, section: Any, members: Mapping[str, lis
     for group in ("inputs", "truth"):
         channels = getattr(section, group, {})
         for name, item in channels.items() if isinstance(channels, dict) else ():
-            if getattr(item, "by", None) is not None:
-                raise loaded.error((*key, group, name, "by"), "is for a sensor with landmarks; use only")
+            if getattr(item, COLUMN, None) is not None:
+                raise loaded.error((*key, group, name, COLUMN), "is for a sensor with landmarks; use only")
     if sensors:
         update["sensors"] = sensors
     return section.model_copy(update=update)
@@ -107,17 +110,18 @@ def _of_source(loaded: Loaded, key: Key, section: Any, members: Mapping[str, lis
 def _members(loaded: Loaded, place: Key, item: ChannelSection, family: str, names: list[str]) -> dict[str, Any]:
     """Return the channels of the members, which select the rows of their landmark."""
     ids = {name.removeprefix(f"{family}_"): name for name in names}
-    if isinstance(item.by, str):
-        column, rules = item.by, {landmark: _equals(landmark) for landmark in ids}
+    if isinstance(item.landmark_column, str):
+        column, rules = item.landmark_column, {landmark: _equals(landmark) for landmark in ids}
     else:
-        if len(item.by or {}) != 1:
-            raise loaded.error((*place, "by"), f"names {len(item.by or {})} columns; name one")
-        ((column, rules),) = (item.by or {}).items()
+        named = item.landmark_column or {}
+        if len(named) != 1:
+            raise loaded.error((*place, COLUMN), f"names {len(named)} columns; name one")
+        ((column, rules),) = named.items()
     unknown = [landmark for landmark in rules if landmark not in ids]
     if unknown:
-        raise loaded.error((*place, "by"), f"names the landmark {unknown[0]!r}; {family} has {', '.join(ids)}")
+        raise loaded.error((*place, COLUMN), f"names the landmark {unknown[0]!r}; {family} has {', '.join(ids)}")
     return {
-        ids[landmark]: item.model_copy(update={"by": None, "only": {**item.only, column: rule}})
+        ids[landmark]: item.model_copy(update={COLUMN: None, "only": {**item.only, column: rule}})
         for landmark, rule in rules.items()
     }
 
@@ -137,4 +141,4 @@ def _equals(landmark: str) -> ConditionSection:
         number = float(landmark)
     except ValueError:
         return ConditionSection(text=(landmark,))
-    return ConditionSection(min=number, max=number)
+    return ConditionSection(range=(number, number))

@@ -85,7 +85,7 @@ def read_log(twin: Twin, duration: float | None, *, blind: bool = False) -> tupl
         source.close()
         raise SourceError(f"{twin.name}: its source has no end; give --duration SECONDS")
     log = Log.of(twin.model)
-    horizon = round(twin.config.time.horizon * 1e9)
+    horizon = round(twin.config.time.max_delay * 1e9)
     # What a late reading is inflated by is asked of the estimate when it comes.
     beside = twin.fold(log) if twin.late.inflate else None
     gap = round(twin.degraded.seconds * 1e9)

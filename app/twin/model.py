@@ -68,7 +68,7 @@ def find_model(loaded: Loaded, key: Key, reference: Model) -> StateSpaceModel:
 
 def model_files(loaded: Loaded) -> tuple[Path, ...]:
     """Return the user's file of the model, those beside it that it imports, and that of its correction."""
-    model, learned = loaded.config.model, loaded.config.learned
+    model, learned = loaded.config.model, loaded.config.correction
     correction = () if learned is None else (_beside(loaded, learned),)
     if not isinstance(model, str):
         return (_beside(loaded, model_file(model)), *correction)
@@ -141,7 +141,7 @@ def configure(model: StateSpaceModel, loaded: Loaded) -> StateSpaceModel:
     field = isinstance(model.states, Field)
     own = () if field else estimated_names(model)  # a field may have a million
     places = [*own, *(item.name for item in model.inputs)]
-    check_names(loaded, ("valid",), config.valid, places, "state or input", model)
+    check_names(loaded, ("valid_range",), config.valid_range, places, "state or input", model)
     for key in ("withhold", "possible"):
         check_names(loaded, (key,), getattr(config, key), own, "state", model)
     check_named(loaded, ("watched",), config.watched or (), model)
@@ -167,10 +167,12 @@ def _assembled(model: StateSpaceModel, loaded: Loaded) -> StateSpaceModel:
     """Return the model with the correction, coloured noise, sensor errors and joint parameters of the YAML."""
     config = loaded.config
     learned, learned_place = None, ""
-    if config.learned is not None:
-        make = maker("corrections", "file", f"{loaded.places.at(('learned',))}: learned", "learned")
-        learned, learned_place = make(loaded, model, _beside(loaded, config.learned))
-    noises = {name: section.over for name, section in config.noise.items() if section.over is not None}
+    if config.correction is not None:
+        make = maker("corrections", "file", f"{loaded.places.at(('correction',))}: correction", "learned")
+        learned, learned_place = make(loaded, model, _beside(loaded, config.correction))
+    noises = {
+        name: section.correlation_time for name, section in config.noise.items() if section.correlation_time is not None
+    }
     given = {name: section.error for name, section in config.sensors.items() if section.error is not None}
     known = [*(item.name for item in model.noises), *map(learned_noise, learned.corrects if learned else ())]
     check_names(loaded, ("noise",), noises, known, "noise", model)
@@ -179,7 +181,7 @@ def _assembled(model: StateSpaceModel, loaded: Loaded) -> StateSpaceModel:
     for name, error in given.items():
         rows = [row.name for row in model.sensors[model.sensor_names.index(name)].rows]
         key = ("sensors", name, "error", "std" if error.std is not None else "variance")
-        errors[name] = ColouredError(one_each(loaded, key, error.variances, rows), error.over)
+        errors[name] = ColouredError(one_each(loaded, key, error.variances, rows), error.correlation_time)
     times = [*map(disturbance_time, noises), *map(error_time, errors)]
     instruments = _instruments(model, loaded)
     sections = parameter_sections(model, config)
@@ -363,8 +365,8 @@ def _possible(state: State, loaded: Loaded) -> tuple[float, float] | None:
     """
     given, positive = loaded.config.possible.get(state.name), state.unit in POSITIVE and state.mean > 2.0 * state.std
     own = state.limits or ((0.0, inf) if positive else None)
-    limits = own if given is None else bounds((given.min, given.max), own)
-    for key, pair, other in (("possible", limits, own), ("valid", state.fitted, limits)):
+    limits = own if given is None else bounds(given, own)
+    for key, pair, other in (("possible", limits, own), ("valid_range", state.fitted, limits)):
         if pair and other and (pair[0] > other[1] or pair[1] < other[0]):
             text = f"is {_ends(pair, state)}, outside the physical limits, {_ends(other, state)}"
             raise loaded.error((key, state.name), f"{text}; give it in the unit of the state")
@@ -381,7 +383,7 @@ def _ends(pair: tuple[float, float], state: State) -> str:
 
 def _ranged(items: Any, loaded: Loaded) -> Any:
     """Return states or inputs with the YAML's ranges of validity; a field stays."""
-    valid, widen = loaded.config.valid, [section.widen for section in loaded.config.parameters.values()]
+    valid, widen = loaded.config.valid_range, [section.widen for section in loaded.config.parameters.values()]
     if isinstance(items, Field):
         return items
     found = (
@@ -389,7 +391,7 @@ def _ranged(items: Any, loaded: Loaded) -> Any:
         for item in items
     )
     return tuple(
-        replace(item, fitted=bounds((own.min, own.max), item.fitted), near=own.extrapolate)
+        replace(item, fitted=bounds(own.range, item.fitted), near=own.extrapolate)
         if (own := valid.get(item.name))
         else item
         for item in found

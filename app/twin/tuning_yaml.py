@@ -58,7 +58,7 @@ def tuning_yaml(
     noises = dict(zip((noise.name for noise in model.noises), map(float, tuning.q), strict=True))
     known = {item.name: item.value for item in model.parameters}
     # How long errors last stands beside their size. Of parameters that are estimated the tuning has none.
-    lasting = {name: section.over for name, section in config.noise.items() if section.over is not None}
+    lasting = {name: section.correlation_time for name, section in config.noise.items() if section.correlation_time}
     erring = [sensor for sensor in model.sensors if sensor.name in config.sensors and config.sensors[sensor.name].error]
     times = {*map(disturbance_time, lasting), *(error_time(sensor.name) for sensor in erring)}
     turned = {name: value for name, value in values.items() if name in config.parameters or value != known[name]}
@@ -72,7 +72,7 @@ def tuning_yaml(
     parameters = {name: item["value"] if list(item) == ["value"] else item for name, item in parameters.items()}
     lines += as_section("parameters", {name: item for name, item in parameters.items() if name not in times})
     if widths is not None or not whole:
-        lines += as_section("valid", _fitted_ranges(config, model, widths))
+        lines += as_section("valid_range", _fitted_ranges(config, model, widths))
     if prior is not None:
         own = model.states[: model.nx - model.considered]  # the prior of the others is that of their parameters
         ends = np.array([state.limits or (-np.inf, np.inf) for state in own])
@@ -80,7 +80,8 @@ def tuning_yaml(
         beliefs = zip(own, means, np.sqrt(np.diag(prior[1])).tolist(), strict=False)
         lines += as_section("prior", {state.name: {"mean": mean, "std": std} for state, mean, std in beliefs})
     errors = {sensor.name: [noises.pop(name) for name in errors_of(sensor)] for sensor in erring}
-    over = {name: {"over": values.get(disturbance_time(name), seconds)} for name, seconds in lasting.items()}
+    times_of = {name: values.get(disturbance_time(name), seconds) for name, seconds in lasting.items()}
+    over = {name: {"correlation_time": seconds} for name, seconds in times_of.items()}
     ranges = bounds_of(config, model)
     lines += as_section(
         "noise",
@@ -121,9 +122,10 @@ def _add_widths(parameters: dict[str, Any], widths: ParameterWidths, spread: Seq
 
 def _fitted_ranges(
     config: TwinSection, model: StateSpaceModel, widths: ParameterWidths | None
-) -> dict[str, dict[str, float]]:
-    """Return the section `valid`: the range of the fit, of each state and input that has one or widens a parameter."""
-    found = {name: section.model_dump(mode="json", exclude_unset=True) for name, section in config.valid.items()}
+) -> dict[str, dict[str, Any]]:
+    """Return the section `valid_range`: of each state and input that has one or widens a parameter."""
+    sections = config.valid_range.items()
+    found = {name: section.model_dump(mode="json", exclude_unset=True) for name, section in sections}
     if widths is None:
         return found
     states = () if isinstance(model.states, Field) else model.states
@@ -132,7 +134,7 @@ def _fitted_ranges(
     limited |= {place for section in parameter_sections(model, config).values() for place in section.widen}
     for name in sorted(limited & set(widths.envelope)):
         low, high = widths.envelope[name]
-        found.setdefault(name, {}).update(rounded({"min": low, "max": high}))
+        found.setdefault(name, {}).update({"range": rounded([low, high])})
     return found
 
 
@@ -144,9 +146,9 @@ def _sensors(
     whole: bool,
 ) -> dict[str, Any]:
     """Return the section `sensors`, given the variances of coloured errors by sensor, and parameters by name."""
-    landmarks = {name: section.at for name, section in config.sensors.items() if section.at is not None and whole}
+    landmarks = {name: section.landmarks for name, section in config.sensors.items() if section.landmarks and whole}
     found: dict[str, Any] = {
-        name: {"at": {key: list(at) for key, at in given.items()}} for name, given in landmarks.items()
+        name: {"landmarks": {key: list(at) for key, at in given.items()}} for name, given in landmarks.items()
     }
     ranges = bounds_of(config, tuning.model)
     for sensor, start in zip(tuning.model.sensors, tuning.model.row_start, strict=True):
@@ -155,8 +157,8 @@ def _sensors(
         variances = [float(value) for value in tuning.r[start : start + len(sensor.rows)]]
         rest = {key: value for key, value in own.items() if whole and key not in ("std", "variance", "use")}
         if sensor.name in errors:
-            over = values.get(error_time(sensor.name), own["error"]["over"])
-            rest["error"] = {"variance": _one_or_all(errors[sensor.name]), "over": over}
+            over = values.get(error_time(sensor.name), own["error"]["correlation_time"])
+            rest["error"] = {"variance": _one_or_all(errors[sensor.name]), "correlation_time": over}
         variance = _within(_one_or_all(variances), ranges.get(f"R.{sensor.name}"))
         found[sensor.name] = {"variance": variance, **rest}
         used = bool(tuning.get(f"use.{sensor.name}"))
@@ -175,7 +177,7 @@ def _within(value: float | list[float], bounds: tuple[float, float] | None) -> A
     values = value if isinstance(value, list) else [value]
     if bounds is None or not all(bounds[0] <= item <= bounds[1] for item in values):
         return value
-    return {"value": value, "from": bounds[0], **({"to": bounds[1]} if bounds[1] < LARGEST else {})}
+    return {"value": value, "range": [bounds[0], bounds[1] if bounds[1] < LARGEST else None]}
 
 
 def _option(entry: Estimator, name: str, value: float) -> float | str:
@@ -221,6 +223,8 @@ def _placed(data: Any, key: Key, value: Any) -> tuple[Key, Any]:
         if name == "variance" and isinstance(data, Mapping) and "variance" not in data and "std" in data:
             name = "std"
             value = rounded(np.sqrt(value).tolist(), 6)
+        if name == "range" and isinstance(data, list):
+            break  # [20, 38] is the short form of {range: [20, 38]}
         found.append(name)
         data = data.get(name) if isinstance(data, Mapping) else None
     if isinstance(data, Mapping) and "value" in data:

@@ -14,6 +14,7 @@ import numpy as np
 
 from config.companion_schema import TuningSection
 from config.loader import Loaded, load, load_text
+from config.old_names import new_overrides
 from config.schema import TwinSection
 from config.source_schema import AssetSection
 from config.tunings import OWN_VALUES, Version, find_version
@@ -203,7 +204,7 @@ def load_twin(
         ConfigError: If the YAML, the version or an override breaks a rule.
         ModelError: If the model's file fails.
     """
-    overrides = dict(overrides or {})
+    overrides = new_overrides(overrides or {})
     named = {key: value for key, value in overrides.items() if key == VERSION}
     return _assemble(load(name_or_path, _of_yaml(overrides) | named), overrides, log_files)
 
@@ -222,7 +223,7 @@ def restore_twin(
         ConfigError: If the YAML breaks a rule.
         ModelError: If the model's file fails, or is no longer there.
     """
-    overrides = dict(overrides or {})
+    overrides = new_overrides(overrides or {})
     return _assemble(load_text(text, Path(base_path), _of_yaml(overrides), version), overrides, None)
 
 

@@ -13,8 +13,9 @@ import numpy as np
 
 from config.companion_schema import AcceptedSection, EvidenceSection, MovedSection, VersionSection
 from config.loader import moved
+from config.old_names import rewrite
 from config.tunings import OWN_VALUES, Version, check_name, folders, load_version, version_files, version_of
-from config.yaml_files import as_section, rewrite, rounded, shown_path, with_section, writing
+from config.yaml_files import as_section, rounded, shown_path, with_section, writing
 from estimators.diagnostics.health import PROBABILITY
 from estimators.diagnostics.score import Score
 from estimators.errors import LARGEST, ConfigError

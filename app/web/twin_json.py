@@ -162,7 +162,7 @@ def model_json(engine: Engine) -> dict[str, Any]:
         "window": twin.config.view.window,
         "recorded": twin.recorded or twin.plan.recorded,
         "speed": twin.config.view.speed,
-        "at": twin.config.view.at,
+        "at": twin.config.view.cursor,
         "scene": twin.config.view.scene.kind,
         "columns": list(columns_of(model)),
     }

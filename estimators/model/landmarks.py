@@ -60,9 +60,10 @@ def with_landmarks(model: StateSpaceModel, places: Places) -> StateSpaceModel:
 
 def missing(model: StateSpaceModel, sensor: Sensor) -> str:
     """Return the message for a sensor whose landmarks are not known."""
+    names = ", ".join(name for name, _ in sensor.place)
     return (
-        f"{model.name}: sensor {sensor.name} has no landmarks; give them under sensors.{sensor.name}.at of the YAML, "
-        f"or by with_landmarks(model, {{{sensor.name!r}: {{'1': ({', '.join(name for name, _ in sensor.place)})}}}})"
+        f"{model.name}: sensor {sensor.name} has no landmarks; give them under sensors.{sensor.name}.landmarks of the "
+        f"YAML, or by with_landmarks(model, {{{sensor.name!r}: {{'1': ({names})}}}})"
     )
 
 

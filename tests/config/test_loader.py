@@ -49,7 +49,7 @@ def test_values_are_read_and_defaults_filled_in():
     assert config.sensors["winding"].variances == (4.0,)
     assert config.sensors["winding"].use is True
     assert config.estimator.name == "kf" and config.estimator.options == {}
-    assert config.history == 200_000 and config.time.horizon == 2.0
+    assert config.history == 200_000 and config.time.max_delay == 2.0
     assert config.source.type == "simulator" and config.source.duration == 120.0
     assert [profile.constant for profile in config.source.inputs["torque"]] == [1.0, None]
     assert config.source.inputs["torque"][1].steps == ((0.0, 1.0), (5.0, 2.0))
@@ -59,9 +59,14 @@ def test_values_are_read_and_defaults_filled_in():
 
 
 def test_every_duration_takes_a_unit():
-    set_to = {"time.tick": "500 ms", "time.stale_after": "2 min", "time.horizon": "0.5 s", "view.window": "1 h"}
+    set_to = {
+        "time.predict_every": "500 ms",
+        "time.stale_after": "2 min",
+        "time.max_delay": "0.5 s",
+        "view.window": "1 h",
+    }
     config = load_text(MOTOR.replace("duration: 120", "duration: 1 d"), Path("motor.yaml"), set_to).config
-    assert (config.time.tick, config.time.stale_after, config.time.horizon) == (0.5, 120.0, 0.5)
+    assert (config.time.predict_every, config.time.stale_after, config.time.max_delay) == (0.5, 120.0, 0.5)
     assert (config.view.window, config.source.duration) == (3600.0, 86400.0)
 
 
@@ -134,15 +139,19 @@ def test_numbers_are_read_as_people_write_them(text, value):
 
 
 def test_a_section_left_empty_means_its_defaults():
-    text = MOTOR + "time:\n  # tick: 1\nview:\n"
-    assert load_text(text, Path("motor.yaml")).config.time.tick == 0.5
+    text = MOTOR + "time:\n  # predict_every: 1\nview:\n"
+    assert load_text(text, Path("motor.yaml")).config.time.predict_every == 0.5
 
 
 def test_overrides_replace_values_and_errors_name_the_option():
-    loaded = load_text(MOTOR, Path("motor.yaml"), {"source.duration": "5", "time.tick": "1e-1", "gate": "null"})
-    assert loaded.config.source.duration == 5.0 and loaded.config.time.tick == 0.1 and loaded.config.gate is None
+    loaded = load_text(
+        MOTOR, Path("motor.yaml"), {"source.duration": "5", "time.predict_every": "1e-1", "gate": "null"}
+    )
+    assert (
+        loaded.config.source.duration == 5.0 and loaded.config.time.predict_every == 0.1 and loaded.config.gate is None
+    )
     said = message(MOTOR, {"time.tock.x": "5"})
-    assert said.startswith("--set time.tock.x=5: time.tock is not known; did you mean tick?")
+    assert said.startswith("--set time.tock.x=5: time.tock is not known; did you mean late?")
 
 
 @cases(__file__, "refused_overrides.csv")
@@ -244,7 +253,7 @@ def test_anchors_stand_under_keys_that_begin_with_x():
 
 PLACES = """\
 model: ./{0}pump.py:Pump         # comments stay
-learned: {0}net.yaml
+correction: {0}net.yaml
 source:
   type: merged
   parts:
@@ -265,9 +274,9 @@ def test_relative_paths_of_a_copy_name_the_same_files(tmp_path, out, back):
         expected["model"] = expected["model"].removeprefix("./")
         assert "# comments stay" in text
     assert parse(text, "a.yaml")[0] == expected
-    shared = PLACES.format("").replace("learned: net", "x-net: &net net.yaml\nlearned: *net #")
+    shared = PLACES.format("").replace("correction: net", "x-net: &net net.yaml\ncorrection: *net #")
     if back:
-        with pytest.raises(ConfigError, match="twin.yaml: an alias shares learned with another key; write the path"):
+        with pytest.raises(ConfigError, match="twin.yaml: an alias shares correction with another key; write the path"):
             moved(shared, tmp_path / "here" / "twin.yaml", tmp_path / "here" / out)
 
 

@@ -22,11 +22,11 @@ source:
           signals: AngularRateX
           units: deg/s
           scale: -1
-          where: {ImuValid: 1, Temp: {max: 80}}
+          valid_if: {ImuValid: 1, Temp: [null, 80]}
         gnss:
           message: gnss_pos
           signals: [Latitude, Longitude]
-          where: {PositionValid: true, PositionAccuracy: {max: 20}}
+          valid_if: {PositionValid: true, PositionAccuracy: [null, 20]}
           convert: east_north
           origin: [55.6, 12.5]
     - type: table

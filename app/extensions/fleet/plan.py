@@ -18,6 +18,7 @@ from app.twin.source import KEY, Plan, kind_of, plan_source
 from app.twin.sources.kind import Opening, matching
 from app.twin.twin import Twin, load_twin
 from config.loader import shipped
+from config.old_names import tell_older
 from config.problems import check_section
 from config.yaml_files import as_flow, read_text
 from estimators.errors import ConfigError, EstimatorError
@@ -118,7 +119,7 @@ class FleetPlan:
         if not isinstance(section, FleetTableSection):
             text = f"a source of type {section.type} keeps no measurements; give --archive FOLDER to keep them"
             raise ConfigError(f"{asset}: {text}")
-        given = section.model_dump(mode="json", exclude_unset=True, by_alias=True)
+        given = section.model_dump(mode="json", exclude_unset=True)
         loaded, column = self.source.loaded, given.pop("asset")
         found = channels(loaded, section, KEY, self.twin.model)
         columns = [*section.time.column, column, *(column_of(name) for _, item in found for name in item.needed)]
@@ -180,6 +181,7 @@ def load_fleet(path: str | os.PathLike[str], overrides: Mapping[str, str] | None
     path = Path(path).expanduser()
     text = read_text(path, "nisus fleet --help")
     section, _, places = check_section(FleetSection, text, path, "a fleet is a mapping with twin and source")
+    tell_older(places)
     named = section.twin
     if named not in shipped():
         named = str(path.parent / Path(named).expanduser())

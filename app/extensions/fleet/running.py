@@ -168,7 +168,7 @@ class RunningFleet:
             messages = getattr(self.source, "messages", self.source)
             if isinstance(messages, Messages) and self._given is None:
                 messages.room = self._room
-            horizon = round(plan.twin.config.time.horizon * 1e9)
+            horizon = round(plan.twin.config.time.max_delay * 1e9)
             self._guard = ClockGuard(self._last.size, horizon, True) if is_utc(self.source) else None
             if self.file is not None:
                 self._continue(self.file)

@@ -28,7 +28,7 @@ def correction_of(loaded: Loaded, model: StateSpaceModel, path: Path) -> tuple[L
         ConfigError: If its file is missing, is wrong, or is of another model.
     """
     if not path.is_file():
-        raise loaded.error(("learned",), f"is {loaded.config.learned!r}; there is no file {shown_path(path)}; "
+        raise loaded.error(("correction",), f"is {loaded.config.correction!r}; there is no file {shown_path(path)}; "
                            "`nisus learn` writes one")  # fmt: skip
     section, places = load_correction(path)
     if section.learned.model != model.name:

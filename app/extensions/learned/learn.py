@@ -47,7 +47,7 @@ def learn_correction(arguments: Arguments) -> int:
             raise ConfigError(f"{option} names nothing; write names with commas")
     _check(arguments)
     net = None if arguments.net is None else run_net(arguments.net, len(features), len(corrects))
-    overrides = {**overrides_of(arguments), "learned": "null"}
+    overrides = {**overrides_of(arguments), "correction": "null"}
     twins = [
         load_twin(arguments.twin, log_files=files or None, overrides=overrides)
         for files in ([Path(part) for part in text.split(",") if part] for text in arguments.log or ("",))
@@ -95,7 +95,7 @@ def learn_correction(arguments: Arguments) -> int:
     with tempfile.TemporaryDirectory(prefix="nisus-") as folder:
         file = Path(folder) / "correction.yaml"
         file.write_text(text(arguments.net and arguments.net.absolute()), encoding="utf-8")
-        corrected = load_twin(arguments.twin, overrides={**overrides, "learned": str(file)})
+        corrected = load_twin(arguments.twin, overrides={**overrides, "correction": str(file)})
     wider = {name: float(trained.before[k]) for k, name in enumerate(corrects) if name in own_noise}
     tunings = twin.tuning, _tuned(twin.tuning, wider), _tuned(corrected.tuning, own_noise)
     recordings = [Recording(log, 1.0, held_out_rows(log, arguments.blocks)) for log in logs]

@@ -102,7 +102,7 @@ def lasting(measured: Measured, estimator: str, options: Mapping[str, float] | N
         f"row{'s' if len(related) > 1 else ''} correlated by up to {worst:+.2f}, "
         + (f"{len(left)} still {'is' if len(left) == 1 else 'are'}, {left[0].subject} most" if left else "none remains")
     )
-    remedy = "put the lines with `over` into the YAML; nisus tune fits their size and time"
+    remedy = "put the lines with `correlation_time` into the YAML; nisus tune fits their size and time"
     return COLOURED.claim(NO if left else YES, figure, reason, remedy), found
 
 
@@ -239,12 +239,13 @@ def _sections(trial: _Trial) -> dict[str, dict[str, object]]:
     for each in trial.appended:
         over = f"{_time(trial.tuning, each):.3g} s"
         if each.noise is not None:
-            found[f"noise.{each.noise}"] = {"variance": rounded(trial.tuning.get(f"Q.{each.noise}"), 3), "over": over}
+            variance = rounded(trial.tuning.get(f"Q.{each.noise}"), 3)
+            found[f"noise.{each.noise}"] = {"variance": variance, "correlation_time": over}
         elif each.sensor is not None:
             sensor = trial.fold.model.sensors[trial.fold.model.sensor_names.index(each.sensor)]
             white, error = f"R.{sensor.rows[0].name}", f"Q.{errors_of(sensor)[0]}"
             found[f"sensors.{each.sensor}"] = {
                 "variance": rounded(trial.tuning.get(white), 3),
-                "error": {"variance": rounded(trial.tuning.get(error), 3), "over": over},
+                "error": {"variance": rounded(trial.tuning.get(error), 3), "correlation_time": over},
             }
     return found

@@ -280,7 +280,7 @@ def yaml_text(
     noise, sensors, read = [], [], drafted.sensors
     for item in drafted.states:
         unit = item.signal.series.unit or "1"
-        over = f", over: {rounded(item.over):g} s" if item.over else ""
+        over = f", correlation_time: {rounded(item.over):g} s" if item.over else ""
         what = f"({unit})²/s" + ("³, of its speed" if item.smooth else "")
         noise.append(
             f"  {item.second if item.smooth else item.name}: {{variance: {_number(item.q)}{over}}}  # {_line(what)}"
@@ -292,7 +292,7 @@ def yaml_text(
                 fields += f", offset: {{std: {_number(step)}}}"
             if reads.error is not None:
                 size, time = _number(rounded(reads.error[0])), rounded(reads.error[1])
-                fields += f", error: {{variance: {size}, over: {time:g} s}}"
+                fields += f", error: {{variance: {size}, correlation_time: {time:g} s}}"
             fields += ", use: false" if reads.name in drafted.held_out else ""
             fields += ", expected: by chance" if comes_by_chance(reads.signal, found.t) else ""
             what = "the rate of " if reads.rate else ""
@@ -318,7 +318,7 @@ def yaml_text(
 title: {_text(_title(drafted))}
 model: ./{name}.py:{model}       # file beside this one, and the name of the model in it
 
-noise:  # model uncertainty, per second; over: how long a disturbance lasts
+noise:  # model uncertainty, per second; correlation_time: how long a disturbance lasts
 {text(noise)}
 
 sensors:  # std: white noise, at least the resolution; error: noise with memory; use: false holds a sensor out;
@@ -331,7 +331,7 @@ gate: null                       # null uses every measurement; 0.9999 rejects o
 time:                            # the slowest sensor reports every {slowest:.3g} s{at_times}
   degraded_after: {degraded:.3g}
   stale_after: {stale:.3g}
-  tick: {max(0.5, slowest):.3g}
+  predict_every: {max(0.5, slowest):.3g}
 
 source:
 {text(source)}
@@ -547,10 +547,10 @@ def _channel(name: str, one: Signal, family: Family | None = None) -> str:
     elif one.unit != one.series.unit and not heading_unit(column):
         fields["units"] = _text(one.unit)
     if one.valid:
-        fields["where"] = f"{{{_text(one.valid)}: 1}}"
+        fields["valid_if"] = f"{{{_text(one.valid)}: 1}}"
     if family is not None:
         ids = ", ".join(f"{_text(key)}: {_id(label)}" for key, label in family.ids.items())
-        fields["by"] = f"{{{_text(family.by)}: {{{ids}}}}}" if ids else _text(family.by)
+        fields["landmark_column"] = f"{{{_text(family.by)}: {{{ids}}}}}" if ids else _text(family.by)
     elif one.series.only is not None:
         by, label = one.series.only
         fields["only"] = f"{{{_text(by)}: {_id(label)}}}"

@@ -38,7 +38,7 @@ def _open(opening: Opening) -> Source:
         for k, (part, share) in enumerate(zip(section.parts, shares, strict=True))
         if share != []
     ]
-    horizon = round(opening.loaded.config.time.horizon * 1e9)
+    horizon = round(opening.loaded.config.time.max_delay * 1e9)
     return Merged([OwnClock(part, Ingest(opening.model, horizon, opening.report)) for part in parts])
 
 
@@ -131,7 +131,7 @@ def _open_table(opening: Opening) -> Source:
             channels=channels,
             width=opening.model.width,
             report=opening.report,
-            horizon=opening.loaded.config.time.horizon,
+            horizon=opening.loaded.config.time.max_delay,
         )
 
     return blamed(opening, table)

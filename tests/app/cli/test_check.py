@@ -147,8 +147,8 @@ def test_ranges_in_words(low, high, text):
 
 
 def test_text_is_the_same_page(nisus):
-    out = nisus("check", "motor_winding", "--duration", "20", "--set", "valid={temperature: {min: 293}}").out
-    assert "valid.temperature leaves out the prior's mean, 35 °C: is it in that unit?" in out
+    out = nisus("check", "motor_winding", "--duration", "20", "--set", "valid_range={temperature: [293, null]}").out
+    assert "valid_range.temperature leaves out the prior's mean, 35 °C: is it in that unit?" in out
     assert "Checklist" in out and "integrity bound" in out and "There is one sensor" in out
     assert max(map(len, out.splitlines())) <= 160
 

@@ -88,14 +88,14 @@ def test_an_estimate_with_too_wide_a_band_is_withheld(tmp_path, nisus):
 @pytest.mark.parametrize(
     ("limits", "grade", "why"),
     [
-        ("min: -10, max: 20", "suspect", r"outside the fitted range \(temperature 4\d\.\d+ °C, fitted at -10 to 20"),
-        ("max: 20", "suspect", "outside"),
-        ("max: 20, extrapolate: 40", "tracking", "too uncertain"),
+        ("[-10, 20]", "suspect", r"outside the fitted range \(temperature 4\d\.\d+ °C, fitted at -10 to 20"),
+        ("[null, 20]", "suspect", "outside"),
+        ("{range: [null, 20], extrapolate: 40}", "tracking", "too uncertain"),
     ],
 )
 def test_the_reason_of_a_withheld_estimate_names_what_left_the_fitted_range(tmp_path, nisus, limits, grade, why):
     """Which may have one end, and be extrapolated."""
-    path = drive(tmp_path, text=DRIVE + f"withhold: {{rate: 1e-3}}\nvalid: {{temperature: {{{limits}}}}}\n")
+    path = drive(tmp_path, text=DRIVE + f"withhold: {{rate: 1e-3}}\nvalid_range: {{temperature: {limits}}}\n")
     found = nisus("fold", path, "--json").json["states"]
     temperature, rate = found["temperature"], found["rate"]
     assert (temperature["grade"], rate["grade"]) == (grade, "withheld")
@@ -306,7 +306,8 @@ def test_the_json_says_what_a_script_needs(tmp_path, nisus):
     lines += ["30.5,41.0,,,1", "460,49.0,49.2,0.02,1"]
     (tmp_path / "drive.csv").write_text("\n".join(["t,y,temperature,rate,good", *lines]))
     yaml = (
-        DRIVE.replace("{columns: y}", "{columns: y, where: {good: 1}}") + "gate: 0.9999\nsensors: {winding: {std: 3}}\n"
+        DRIVE.replace("{columns: y}", "{columns: y, valid_if: {good: 1}}")
+        + "gate: 0.9999\nsensors: {winding: {std: 3}}\n"
     )
     (tmp_path / "drive.yaml").write_text(yaml)
     figures = {}

@@ -77,8 +77,8 @@ def test_where_is_proposed_for_columns_of_quality(tmp_path, nisus):
     (tmp_path / "a.csv").write_text(f"t,x,Status,Quality,State\n{rows}")
     text = " ".join(nisus("log", str(tmp_path / "a.csv")).out.split())
     for condition in ('{"Status": ["Good"]}', '{"Quality": {"min": 192}}'):
-        assert f"(rows: 2); to leave these rows out give where: {condition}" in text
-    assert text.count(" where: ") == 2
+        assert f"(rows: 2); to leave these rows out give valid_if: {condition}" in text
+    assert text.count(" valid_if: ") == 2
 
 
 @pytest.mark.parametrize("ending", [".csv", ".parquet", ".npz", ".mat"])

@@ -1,6 +1,7 @@
 """A twin continues from its store, also after a kill, with the edits of its users; without a usable one it runs."""
 
 import asyncio
+import json
 import re
 import sqlite3
 import sys
@@ -122,6 +123,24 @@ def test_a_replay_continues_where_it_was(tmp_path):
     after.source.restart()
     after.put(batch.select(slice(0, 100))).write().kill()
     assert pull_all(Session(path, Replayed()).engine).events.t.size == 100
+
+
+def test_a_store_of_the_version_before_is_continued_with_its_source(path):
+    """What it has of the twin and its source has the names of that version."""
+    batch = walk(600)
+    Session(path, Replayed()).put(batch.select(slice(0, 250))).write().kill()
+    with closing(sqlite3.connect(path, isolation_level=None)) as file:
+        parts = dict(file.execute("SELECT kind, data FROM parts WHERE kind IN ('twin', 'state')").fetchall())
+        twin, state = (json.loads(parts[kind]) for kind in ("twin", "state"))
+        assert "  max_delay: 2.0  " in twin["yaml"]
+        twin |= {"yaml": twin["yaml"].replace("max_delay:", "horizon:"), "overrides": {"time.tick": "0.5"}}
+        state["source"] = f"(SimulatorSection(where={{}}), {state['source']})"
+        for kind, value in ("twin", twin), ("state", state):
+            data = json.dumps(value).encode()
+            file.execute("UPDATE parts SET data = ?, crc = ? WHERE kind = ?", (data, zlib.crc32(data), kind))
+    after = Session(path, Replayed()).put(batch)
+    assert "continued from" in after.notices()[0]
+    assert_same(pull_all(after.engine).events, pull_all(Session(None, Replayed()).put(batch).engine).events)
 
 
 @pytest.mark.parametrize("whose", ["source", "machine"])

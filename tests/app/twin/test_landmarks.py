@@ -76,9 +76,9 @@ source:
 ONE = f"""\
 model: ./robot.py:One
 sensors:
-  sighting: {{std: [0.2, 0.03], at: {{6: [4, 1], 7: [-3, 5], 15: [1, -6]}}}}
+  sighting: {{std: [0.2, 0.03], landmarks: {{6: [4, 1], 7: [-3, 5], 15: [1, -6]}}}}
 {SOURCE}\
-    sighting: {{columns: [r, b], by: id}}
+    sighting: {{columns: [r, b], landmark_column: id}}
 """
 MANY = "\n".join(
     [

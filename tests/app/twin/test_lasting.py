@@ -18,10 +18,10 @@ pytestmark = pytest.mark.usefixtures("inside")
 LASTING = """\
 model: motor_winding
 noise:
-  temperature: {variance: 0.5, over: 40 s}
+  temperature: {variance: 0.5, correlation_time: 40 s}
   rate: {variance: 0.001}
 sensors:
-  winding: {variance: 0.25, error: {std: 2, over: 5 min}}
+  winding: {variance: 0.25, error: {std: 2, correlation_time: 5 min}}
 estimator: kf
 source: {type: simulator, seed: 1, step: 1.0, duration: 4000}
 """
@@ -48,14 +48,16 @@ def test_states_parameters_and_noises_are_appended():
 def test_what_is_appended_may_be_named_wherever_a_state_or_a_parameter_may():
     text = LASTING + (
         "prior: {winding_error: {mean: 1, std: 3}}\nestimate: {winding_error_time: {std: 50}}\n"
-        "valid: {winding_error: {min: -9, max: 9}}\nview: {pairs: [[temperature, winding_error]]}\n"
+        "valid_range: {winding_error: [-9, 9]}\nview: {pairs: [[temperature, winding_error]]}\n"
     )
     twin = twin_of(text.replace("kf", "ekf"))
     assert twin.model.state_names[-2:] == ("winding_error", "winding_error_time")
     error = twin.model.states[3]
     assert (error.mean, error.std, error.fitted) == (1.0, 3.0, (-9.0, 9.0))
     assert twin_of(LASTING, overrides={"p.winding_error_time": "60"}).tuning.get("p.winding_error_time") == 60.0
-    assert twin_of(LASTING, overrides={"noise.temperature.over": "2 min"}).model.parameters[0].value == 120.0
+    assert (
+        twin_of(LASTING, overrides={"noise.temperature.correlation_time": "2 min"}).model.parameters[0].value == 120.0
+    )
 
 
 @pytest.mark.parametrize(
@@ -71,18 +73,18 @@ def test_what_cannot_last_is_one_line_with_its_place(old, new, words):
 
 
 def test_a_field_has_no_lasting_error():
-    field = "model: thermal_field\nnoise: {temperature: {std: 1, over: 9}}\nsource: {type: simulator}\n"
+    field = "model: thermal_field\nnoise: {temperature: {std: 1, correlation_time: 9}}\nsource: {type: simulator}\n"
     assert refusal(field) == (
-        "motor.yaml:2: noise.temperature.over: model thermal_field is a field, whose noise cannot have a "
+        "motor.yaml:2: noise.temperature.correlation_time: model thermal_field is a field, whose noise cannot have a "
         "correlation time"
     )
 
 
 def test_the_schema_tells_editors_of_it():
     parts = json_schema()["$defs"]
-    assert "Correlation time" in parts["NoiseSection"]["properties"]["over"]["description"]
-    assert parts["ErrorSection"]["required"] == ["over"]
-    kinds = {item.get("type") for item in parts["ErrorSection"]["properties"]["over"]["anyOf"]}
+    assert "Correlation time" in parts["NoiseSection"]["properties"]["correlation_time"]["description"]
+    assert parts["ErrorSection"]["required"] == ["correlation_time"]
+    kinds = {item.get("type") for item in parts["ErrorSection"]["properties"]["correlation_time"]["anyOf"]}
     assert kinds == {"number", "string"}
 
 
@@ -102,7 +104,9 @@ def test_a_simulation_whose_time_is_known_is_white_with_it_and_not_without():
     result = score(track, log.events, twin.model)
     assert result.nis_low < result.nis < result.nis_high
     # White noise alone, over the readings: a truth of a temperature at each of them.
-    white = twin_of(LASTING.replace(", over: 40 s", "").replace(", error: {std: 2, over: 5 min}", ""))
+    white = twin_of(
+        LASTING.replace(", correlation_time: 40 s", "").replace(", error: {std: 2, correlation_time: 5 min}", "")
+    )
     readings = log.events.select(log.events.kind == READING)
     alone = as_log(readings._replace(value=readings.value[:, : white.model.width]))
     blind = fold("kf", white.model, white.tuning, alone)

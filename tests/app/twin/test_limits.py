@@ -65,8 +65,8 @@ def test_limits_reach_the_sensor(limits, expected):
 
 
 def test_ranges_take_the_place_of_the_models():
-    valid = "valid: {temperature: {min: 0, max: 150, extrapolate: 20}}"
-    twin = twin_of(limited("use: true", f"{valid}\npossible: {{rate: {{min: -9}}}}"))
+    valid = "valid_range: {temperature: {range: [0, 150], extrapolate: 20}}"
+    twin = twin_of(limited("use: true", f"{valid}\npossible: {{rate: [-9, null]}}"))
     temperature, rate = twin.model.states
     assert (temperature.fitted, temperature.near, temperature.limits) == ((0.0, 150.0), 20.0, None)
     assert rate.limits == (-9.0, np.inf)

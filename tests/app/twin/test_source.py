@@ -34,7 +34,7 @@ source:
     winding:
       message: THERMAL
       signals: WindingTemp
-      where: {Valid: 1}
+      valid_if: {Valid: 1}
 """
 
 TABLE = """\

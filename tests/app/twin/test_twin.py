@@ -135,8 +135,10 @@ def test_a_model_from_a_file_beside_the_yaml(monkeypatch):
 
 def test_a_correction_without_its_extension_is_one_line(monkeypatch):
     monkeypatch.setattr(extensions, "registered", lambda kind: {})
-    text = refusal("model: motor_winding\nlearned: no.yaml\nsource: {type: simulator}\n")
-    assert text.startswith("motor.yaml:2: learned: needs an extension; install it with `pip install 'nisus[learned]'`")
+    text = refusal("model: motor_winding\ncorrection: no.yaml\nsource: {type: simulator}\n")
+    assert text.startswith(
+        "motor.yaml:2: correction: needs an extension; install it with `pip install 'nisus[learned]'`"
+    )
 
 
 @cases(__file__, "failing_models.csv")

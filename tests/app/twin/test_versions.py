@@ -196,7 +196,10 @@ def test_options_of_the_first_filter_are_kept_for_another():
 
 
 def test_how_long_errors_last_stands_beside_their_size():
-    given = {"noise.winding": "{variance: 0.01, over: 2 min}", "sensors.yoke.error": "{std: 0.7, over: 40}"}
+    given = {
+        "noise.winding": "{variance: 0.01, correlation_time: 2 min}",
+        "sensors.yoke.error": "{std: 0.7, correlation_time: 40}",
+    }
     twin = load_twin("motor_can", overrides=given)
     same(pasted(twin, "ekf", twin.tuning).tuning, twin.tuning)
     tuning = twin.tuning.set("p.winding_disturbance_time", 33.3).set("p.yoke_error_time", 11.0)
@@ -205,7 +208,7 @@ def test_how_long_errors_last_stands_beside_their_size():
     assert "_time" not in tuning_yaml(twin.config, "ekf", tuning)
     # A correlation time that is estimated has no place in the tuning: the file's stays.
     twin = load_twin("motor_can", overrides={**given, "estimate.winding_disturbance_time": "{std: 30}"})
-    assert "over: 120}" in tuning_yaml(twin.config, "ekf", twin.tuning)
+    assert "correlation_time: 120}" in tuning_yaml(twin.config, "ekf", twin.tuning)
 
 
 def test_what_a_version_does_not_say_stays_the_twins(winding):

@@ -23,7 +23,7 @@ JSON, LINES, ARROW = "application/json", "application/x-ndjson", "application/vn
 
 def opened():
     # Without rows of predictions: the newest row is that of the newest measurement.
-    twin = load_twin("motor_winding", overrides={"source": "{type: push}", "time.tick": "1000"})
+    twin = load_twin("motor_winding", overrides={"source": "{type: push}", "time.predict_every": "1000"})
     served = ServedEngine(twin=twin, behind=lambda _: twin.open_source(ignore))
     with pytest.MonkeyPatch.context() as patch:
         # On a busy machine, too, an answer says what became of its messages.
@@ -109,7 +109,7 @@ def test_null_is_a_dropout(page):
 
 
 def test_an_answer_says_what_became_of_a_message(page):
-    horizon, ahead = page.engine.twin.config.time.horizon, {"time": time.time_ns() + 3600 * SECOND}
+    horizon, ahead = page.engine.twin.config.time.max_delay, {"time": time.time_ns() + 3600 * SECOND}
     late, stale = (message(110 - factor * horizon, 42.0) for factor in (0.5, 2.0))
     for item in (late, stale):
         item["time"] = int(item["time"])

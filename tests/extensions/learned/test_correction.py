@@ -55,7 +55,7 @@ def test_its_noise_is_tuned_like_any_other():
 
 
 def test_a_twin_without_is_what_it_was():
-    bare = corrected(RIGHT, overrides={"learned": "null"})
+    bare = corrected(RIGHT, overrides={"correction": "null"})
     alone = load_twin("motor_winding").model
     assert bare.model.f is alone.f and bare.model.Q is alone.Q and bare.model.noises == MODELS["motor_winding"].noises
 

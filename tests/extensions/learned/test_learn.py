@@ -88,7 +88,7 @@ def test_what_the_model_leaves_out_is_learned_kept_and_folded(heated, kind, nisu
     done = nisus("learn", heated, *LEARN, "--kind", kind, "--degree", 2, "--keep", keep)
     assert "Better on blocks from which it did not learn." in done.out and "kept" in done.err
     alone = load_twin(heated)
-    noise = {"learned": keep.name, "noise.body.variance": "0.03"}
+    noise = {"correction": keep.name, "noise.body.variance": "0.03"}
     twin = load_twin(heated, overrides=noise)
     assert [item.name for item in twin.model.noises] == ["body", "shell", "body_learned"]
     correction = learned_of(load_correction(keep)[0], keep).correction
@@ -132,7 +132,7 @@ def test_a_net_is_judged_kept_and_folded(heated, nisus):
     more = "--kind", "net", "--net", net, "--keep", keep, "--estimator", "enkf"
     assert "Blocks held out, folded" in nisus("learn", heated, *LEARN, *more).out
     assert yaml.safe_load(keep.read_text())["net"] == "net.onnx"
-    twin = load_twin(heated, overrides={"learned": keep.name, "estimator": "filterpy-ekf"})
+    twin = load_twin(heated, overrides={"correction": keep.name, "estimator": "filterpy-ekf"})
     assert twin.model.black_box
     log, _ = read_log(twin, 100.0)
     track = folded(twin.estimator, twin.model, log, twin.tuning).track

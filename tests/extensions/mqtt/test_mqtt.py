@@ -91,7 +91,7 @@ def test_a_broker_that_is_lost_and_back_delays_nothing_and_is_reported(serve, br
 def received(serve, broker, topics):
     """A served twin that reads topics of the broker, to which it is connected."""
     source = {"type": "mqtt", "host": "127.0.0.1", "port": broker.port, "topics": topics}
-    twin = load_twin("motor_winding", overrides={"source": json.dumps(source), "time.tick": "1000"})
+    twin = load_twin("motor_winding", overrides={"source": json.dumps(source), "time.predict_every": "1000"})
     page = serve(twin=twin, behind=lambda report: twin.open_source(page_report))
     wait_for(page.engine.source.inner.connected.is_set)
     return page

@@ -249,7 +249,7 @@ class Bench:
     ) -> StressFold:
         twin = self.twin
         log = Log.of(twin.model, capacity=max(1, len(events)))
-        _, stale = log.extend(events, round(twin.config.time.horizon * 1e9))
+        _, stale = log.extend(events, round(twin.config.time.max_delay * 1e9))
         truth = log.events.select(slice(None))
         untold = Log.resume(twin.model, None, without_truth(truth))
         return StressFold(self._folded(estimator, tuning, untold, None, prior), truth, stale)

@@ -13,7 +13,7 @@ BEGIN = 1_767_225_600 * SECOND
 
 def pushed_twin(outputs, source="{type: push}", **more):
     """The twin of a motor's winding with these outputs; `more` overrides its YAML."""
-    given = {"source": source, "outputs": json.dumps(outputs), "time.tick": "1000"}
+    given = {"source": source, "outputs": json.dumps(outputs), "time.predict_every": "1000"}
     return load_twin("motor_winding", overrides=given | more)
 
 

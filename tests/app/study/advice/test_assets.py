@@ -6,7 +6,7 @@ import pytest
 from app.study.advice.measured import UNTOLD, Exclusion, Measured, without_faults
 from app.study.advice.verdict import Advice, advise, changed, details, finding, lines
 from app.twin.twin import load_twin
-from config.yaml_files import rewrite
+from config.old_names import rewrite
 from estimators.diagnostics.episodes import Episode
 from estimators.log import READING
 from estimators.registry import find_entry
@@ -118,7 +118,7 @@ def test_an_error_that_lasts_is_found_with_its_size_and_time(told, tmp_path):
     assert list(found.sections) == ["sensors.float"]
     entry = found.sections["sensors.float"]
     # 160 times as long as it lasts: logarithms of its time and variance are off by √(2 / 160) = 0.11 at best.
-    assert float(entry["error"]["over"].removesuffix(" s")) == pytest.approx(recordings.LASTS, rel=0.5)
+    assert float(entry["error"]["correlation_time"].removesuffix(" s")) == pytest.approx(recordings.LASTS, rel=0.5)
     assert entry["error"]["variance"] == pytest.approx(recordings.ERROR**2, rel=0.5)
     assert entry["variance"] == pytest.approx(recordings.WHITE**2, rel=0.3)
     # The lines as they are put in make a twin that is consistent.

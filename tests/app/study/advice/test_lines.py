@@ -5,7 +5,8 @@ import json
 import pytest
 
 from app.study.advice.verdict import Advice, changed, lines, with_entry
-from config.yaml_files import parse, rewrite
+from config.old_names import rewrite
+from config.yaml_files import parse
 from estimators.errors import ConfigError
 from tests.cases import cases
 
@@ -36,12 +37,12 @@ def test_the_section_gives_way_and_nothing_else(end, tmp_path):
 
 @cases(__file__, "entries.csv")
 def test_an_entry_takes_the_place_of_what_it_says_too(before, after):
-    text = with_entry(before, "noise.a", {"variance": 4.0, "over": "3 s"})
+    text = with_entry(before, "noise.a", {"variance": 4.0, "correlation_time": "3 s"})
     data, _ = parse(text, "x")
     for comment in ("# Q", "# by hand", "# of old", "# of b"):
         assert text.count(comment) == before.count(comment)
     assert "# of b\n" not in before or "# of b\n  b:" in text
-    assert data == {"noise": {"a": {"variance": 4, "over": "3 s"}, **json.loads(after)}, "gate": None}
+    assert data == {"noise": {"a": {"variance": 4, "correlation_time": "3 s"}, **json.loads(after)}, "gate": None}
 
 
 def test_what_else_an_entry_says_stays():

@@ -215,7 +215,7 @@ def test_rows_of_several_sources_are_sensors_that_by_tells_apart(tmp_path, name,
     log = csv(tmp_path / "plant.csv", **dict(zip(("t", name, "value"), zip(*rows, strict=True), strict=True)))
     twin, read, planned = drafted(tmp_path, log)
     assert [one.role for one in planned.roles if one.signal.series.only] == ["sensor", "sensor"]
-    assert 'value: {columns: "value", by: ' in twin.path.read_text()
+    assert 'value: {columns: "value", landmark_column: ' in twin.path.read_text()
     for k, sensor in enumerate(sorted(twin.model.sensor_names, key=lambda sensor: not sensor.endswith(("3", "101")))):
         t, found = of_sensor(read, twin, sensor)
         assert t.tolist() == [s * 10**9 for s in range(200)] and found.tolist() == values[k].tolist()

@@ -93,7 +93,7 @@ def test_rerun_in_a_window_of_its_own_shares_the_time_of_the_page(visit, session
 
 
 def test_a_recording_opens_folded_and_is_replayed_from_the_cursor(visit):
-    with running("motor_can", None, log=TWINS.parent / "logs" / "motor_can.blf", **{"view.at": "60"}) as session:
+    with running("motor_can", None, log=TWINS.parent / "logs" / "motor_can.blf", **{"view.cursor": "60"}) as session:
         engine = session.engine
         page = visit(session.url)
         until(page, "window.nisus.view.at === 60")

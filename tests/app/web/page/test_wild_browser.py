@@ -170,8 +170,8 @@ def test_sentences_have_the_words_of_names_and_clocks_count_days(page):
 def test_a_withheld_estimate_has_its_reason_in_place_of_a_value_and_a_band_without_a_line(
     visit, tmp_path, limit, warmest
 ):
-    valid = f"{{temperature: {{min: -10, max: {warmest}}}}}"
-    limits = {"withhold": f"{{rate: {limit}}}", "valid": valid, "source.duration": "60"}
+    valid = f"{{temperature: [-10, {warmest}]}}"
+    limits = {"withhold": f"{{rate: {limit}}}", "valid_range": valid, "source.duration": "60"}
     with running("motor_winding", **limits) as session:
         page = visit(session.url)
         reason = session.engine.status().withheld["rate"]

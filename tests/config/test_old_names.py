@@ -1,0 +1,119 @@
+"""Names and notations of the version before: read with one line, and rewritten by `nisus migrate`."""
+
+import logging
+
+import pytest
+
+from config import old_names
+from config.loader import load
+from config.old_names import new_key, rewrite, rewritten
+from tests.cases import cases
+
+OLD = """model: battery_cell           # a cell
+prior: {soc: {mean: 0.5, std: 0.1}}
+valid:                         # where it holds
+  temperature: {min: 20, max: 38.0, extrapolate: 5}
+  current: {
+    max: 6                     # A
+  }
+possible: {soc: {min: 0, max: 1}}
+noise: {v1: {variance: {value: 1e-3, from: 1e-4}, over: 2 min}}
+sensors:
+  voltage:
+    std:
+      value: 0.5               # measured
+      from: 0.3
+      to: 0.8                  # by its data sheet
+    error: {std: 0.02, over: 3 s}
+time: {horizon: 0.5, tick: 0.05}
+source:
+  type: merged
+  parts:
+  - type: table
+    files: a.csv
+    time: {column: t}
+    sensors: {voltage: {columns: u, where: {ok: {min: 1}, flag: Good}, only: {tag: {min: 3, max: 4}}}}
+  - &part
+    type: table
+    files: b.csv
+    time: {column: t}
+    inputs: {current: {columns: i, where: &where {ok: {max: 2}}}, air: {columns: a, where: *where}}
+view: {"at": 12}
+"""
+
+NEW = """model: battery_cell           # a cell
+prior: {soc: {mean: 0.5, std: 0.1}}
+valid_range:                         # where it holds
+  temperature: {range: [20, 38.0], extrapolate: 5}
+  current: [null, 6]
+                         # A
+
+possible: {soc: [0, 1]}
+noise: {v1: {variance: {value: 1e-3, range: [1e-4, null]}, correlation_time: 2 min}}
+sensors:
+  voltage:
+    std:
+      {value: 0.5, range: [0.3, 0.8]}               # measured
+
+                  # by its data sheet
+    error: {std: 0.02, correlation_time: 3 s}
+time: {max_delay: 0.5, predict_every: 0.05}
+source:
+  type: merged
+  parts:
+  - type: table
+    files: a.csv
+    time: {column: t}
+    sensors: {voltage: {columns: u, valid_if: {ok: [1, null], flag: Good}, only: {tag: [3, 4]}}}
+  - &part
+    type: table
+    files: b.csv
+    time: {column: t}
+    inputs: {current: {columns: i, valid_if: &where {ok: [null, 2]}}, air: {columns: a, valid_if: *where}}
+view: {cursor: 12}
+"""
+
+
+def loaded(tmp_path, text, **overrides):
+    path = tmp_path / "cell.yaml"
+    path.write_text(text)
+    return load(path, {key.replace("__", "."): value for key, value in overrides.items()})
+
+
+def test_the_text_of_the_version_before_becomes_that_of_this_one_with_its_comments():
+    assert rewritten(OLD) == NEW and rewritten(NEW) == NEW
+    values = "{range: [1, 2]}", "[1, 2]", "{value: 3, range: [null, 4]}"
+    assert [rewritten(text) for text in values] == list(values)
+
+
+def test_a_twin_of_the_version_before_is_that_of_this_one_and_one_line_names_what_changed(tmp_path, caplog):
+    old_names._tell.cache_clear()
+    with caplog.at_level(logging.WARNING, "nisus"):
+        old, new = loaded(tmp_path, OLD), loaded(tmp_path, NEW)
+        loaded(tmp_path, OLD)
+    assert old.config == new.config and old.text == NEW
+    assert old.places.at(("time", "max_delay")) == f"{tmp_path / 'cell.yaml'}:17"
+    (line,) = caplog.messages
+    assert line.startswith(f"{tmp_path / 'cell.yaml'}: valid (line 3) is valid_range now, ")
+    assert line.endswith(f"an interval is [low, high] now; `nisus migrate {tmp_path / 'cell.yaml'}` rewrites it")
+
+
+@cases(__file__, "old_keys.csv")
+def test_a_key_of_the_version_before_is_one_of_this_one_where_it_was_one(old, new):
+    assert ".".join(new_key(tuple(old.split(".")))) == new
+
+
+def test_what_is_no_mapping_of_the_version_before_loses_nothing():
+    for text in ("valid: {soc: {min: 0, mox: 1}}", "learned: {file: a}", "valid: [", "noise: {a: {over: {b: 1}}}"):
+        new = rewritten(text)
+        assert sorted(new.replace("valid_range", "valid").replace("correlation_time", "over")) == sorted(text)
+
+
+@pytest.mark.parametrize("head", ["", "\ufeff"])
+@pytest.mark.parametrize("end", ["\n", "\r\n"])
+def test_a_file_is_rewritten_whole_whatever_its_lines_end_with(tmp_path, head, end):
+    path = tmp_path / "cell.yaml"
+    path.write_text(head + OLD.replace("\n", end), encoding="utf-8", newline="")
+    kept = rewrite(path, lambda text: text)
+    assert path.read_bytes().decode() == NEW.replace("\n", end)
+    assert kept.read_bytes().decode() == head + OLD.replace("\n", end)
