@@ -127,5 +127,5 @@ class TuningSection(Section):
         GateSection | None, BeforeValidator(as_gate, json_schema_input_type=GateProbability | GateSection | None)
     ] = None
     """The gate; null for none."""
-    commissioned: dict[str, NormalSection] = {}
+    baseline: dict[str, NormalSection] = {}
     """Baseline by sensor row, recorded when it was accepted."""

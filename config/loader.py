@@ -17,7 +17,18 @@ from .old_names import read_yaml, tell_older
 from .problems import report, shown
 from .schema import ParameterSection, TwinSection, as_gate
 from .tunings import Version, find_version, keep_options, overlay
-from .yaml_files import TWINS, Key, ValuePlaces, dotted, parse, read_text, shipped, shown_path, with_values
+from .yaml_files import (
+    TWINS,
+    Key,
+    ValuePlaces,
+    baseline_file,
+    dotted,
+    parse,
+    read_text,
+    shipped,
+    shown_path,
+    with_values,
+)
 
 
 @dataclass(frozen=True)
@@ -76,17 +87,22 @@ def load(name: str | os.PathLike[str], overrides: Mapping[str, str] | None = Non
     given = dict(overrides or {})
     reference = given.pop("tuning", None)
     version = None if reference is None else find_version(path, reference)
-    loaded = load_text(text, path, given, version)
+    loaded = load_text(text, path, given, version, baseline_file(path))
     tell_older(loaded.places)
     return loaded
 
 
 def load_text(
-    text: str, path: Path, overrides: Mapping[str, str] | None = None, version: Version | None = None
+    text: str,
+    path: Path,
+    overrides: Mapping[str, str] | None = None,
+    version: Version | None = None,
+    baseline: Path | None = None,
 ) -> Loaded:
     """Check a twin's YAML that has been read already; relative paths in it start at the folder of `path`.
 
-    The values of a tuning version are put in place of its own, and the overrides in place of both.
+    The section of `baseline`, if there is such a file, is appended to the text. The values of a tuning version are put
+    in place of its own, and the overrides in place of both.
 
     Raises:
         ConfigError: With a line for each of the first problems.
@@ -97,6 +113,8 @@ def load_text(
         raise ConfigError(f"{file}:1: the file is empty; a twin needs at least model and source")
     if not isinstance(data, dict):
         raise ConfigError(f"{file}:1: the file is {shown(data)}; it must be a mapping of keys and values")
+    if baseline is not None and baseline.is_file():
+        text += _add_baseline(data, places, baseline)
     if version is not None:
         overlay(data, places, version)
     # First what is named as a whole, then what is in it: a filter, then its options.
@@ -110,6 +128,19 @@ def load_text(
         config = config.model_copy(update={"name": _name(path)})
     without = None if version is None else load_text(text, path, overrides)
     return Loaded(config, path, text, places, version, without)
+
+
+def _add_baseline(data: dict[str, Any], places: ValuePlaces, path: Path) -> str:
+    """Put the section of a baseline's file into a twin's data; return its text."""
+    text, own, lines = read_yaml(read_text(path, "nisus twins"), shown_path(path))
+    if not isinstance(own, dict) or set(own) != {"baseline"}:
+        rule = "it must hold the section `baseline` alone; write it anew with `nisus commission --write`"
+        raise ConfigError(f"{lines.file}:1: the file is {shown(own)}; {rule}")
+    if "baseline" in data:
+        raise ConfigError(f"{places.at(('baseline',))}: baseline stands here and in {lines.file}; keep one")
+    data |= own
+    places.options |= {key: lines.at(key) for key in lines.lines if key}
+    return f"\n{text}"
 
 
 def moved(text: str, path: Path, out: Path) -> str:

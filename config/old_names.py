@@ -27,6 +27,7 @@ CHANNELS = [("source", group, ANY) for group in ("sensors", "inputs", "truth")]
 RENAMED: dict[tuple[str | None, ...], str] = {
     ("learned",): "correction",
     ("valid",): "valid_range",
+    ("commissioned",): "baseline",
     ("time", "horizon"): "max_delay",
     ("time", "tick"): "predict_every",
     ("view", "at"): "cursor",
@@ -70,11 +71,11 @@ def new_key(key: Key) -> Key:
     return found
 
 
-def new_overrides(overrides: Mapping[str, str]) -> dict[str, str]:
-    """Return the values of `--set` by the names and notations of this version."""
+def new_overrides(overrides: Mapping[str, str], *, tell: bool = False) -> dict[str, str]:
+    """Return the values of `--set` by the names and notations of this version; `tell` says which are older."""
     ways = {key: new_key(tuple(key.split("."))) for key in overrides}
     for key, way in ways.items():
-        if key != dotted(way):
+        if tell and key != dotted(way):
             _tell(f"--set {key}: it is {dotted(way)} now")
     return {dotted(ways[key]): rewritten(text, ways[key]) for key, text in overrides.items()}
 

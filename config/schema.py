@@ -486,9 +486,10 @@ class TwinSection(Section):
     ] = None
     """Probability with which a valid measurement passes the gate, for example 0.9973; measurements outside are
     rejected. Or {probability, kind, reopen}. Default: null, no gate."""
-    commissioned: dict[str, NormalSection] = {}
-    """Baseline by sensor row, recorded when this tuning was accepted; alarms report deviations from it. Default:
-    innovations that are white and consistent with the filter's covariance."""
+    baseline: dict[str, NormalSection] = {}
+    """Baseline by sensor row, recorded when this tuning was accepted; alarms report deviations from it. It stands here
+    or, as `nisus commission` writes it, in NAME.baseline.yaml beside NAME.yaml. Default: innovations that are white and
+    consistent with the filter's covariance."""
     time: TimeSection = TimeSection()
     """Treatment of late and missing measurements."""
     maintenance: tuple[MaintenanceSection, ...] = ()

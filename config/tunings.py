@@ -134,7 +134,7 @@ def overlay(data: dict[str, Any], places: ValuePlaces, version: Version) -> None
         if isinstance(filters, dict) and name is not None:
             data["filters"] = {key: value for key, value in filters.items() if key != name.name}
     for key, value in given.items():
-        if key in ("estimator", "gate", "commissioned") or not isinstance(value, dict):
+        if key in ("estimator", "gate", "baseline") or not isinstance(value, dict):
             if value is not None or key == "gate":
                 data[key] = value
                 _placed(places, (key,), version)

@@ -60,7 +60,21 @@ for _name, _pattern, _first in (
 
 def shipped() -> list[str]:
     """Return the names of the bundled twins."""
-    return sorted(path.stem for path in TWINS.glob("*.yaml"))
+    return sorted(path.stem for path in yaml_files(TWINS))
+
+
+BASELINE = ".baseline.yaml"  # End of the name of a file beside a twin's: NAME.baseline.yaml
+
+
+def baseline_file(path: Path) -> Path:
+    """Return the file with the baseline of the twin in another file."""
+    return path.with_name(f"{path.stem}{BASELINE}")
+
+
+def yaml_files(folder: Path) -> list[Path]:
+    """Return the YAML files of a folder but those of baselines, by name."""
+    found = (path for path in folder.glob("*") if path.suffix in (".yaml", ".yml") and path.is_file())
+    return sorted(path for path in found if not path.name.endswith(BASELINE))
 
 
 @dataclass

@@ -101,12 +101,12 @@ def notices():
     return (found | verdicts | {"recovered"}) - OF_THE_PROGRAM
 
 
-SETTINGS = {"commissioned", "integrity", "refit"}
+SETTINGS = {"baseline", "integrity", "refit"}
 """A section of the YAML and a figure of the status that change what the twin says."""
 
 
 def test_the_settings_are_there():
-    assert {"commissioned", "refit"} <= TwinSection.model_fields.keys() and "integrity" in Status.__dataclass_fields__
+    assert {"baseline", "refit"} <= TwinSection.model_fields.keys() and "integrity" in Status.__dataclass_fields__
 
 
 @pytest.mark.parametrize("word", sorted(outcomes() | notices() | SETTINGS))

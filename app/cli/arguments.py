@@ -365,7 +365,7 @@ class TuneCommand(JsonOption, ClusterOption, PartOptions, EstimatorOption, TwinO
 class CommissionCommand(JsonOption, FoldOptions):
     """Record the normal innovations of a twin from fault-free data; later alarms then report changes from it.
 
-    Prints the section `commissioned` for the twin's YAML, or writes it there.
+    Prints the section `baseline`, or writes it to NAME.baseline.yaml beside the twin's NAME.yaml.
 
     Examples:
       nisus commission motor_bench --duration 1800
@@ -375,7 +375,7 @@ class CommissionCommand(JsonOption, FoldOptions):
     force: Flag = False
     """Accept a log that its own detectors or calibration contradict; the baseline keeps the reason as a mark."""
     write: Flag = False
-    """Write the section into the twin's YAML, replacing the one there."""
+    """Write the section to NAME.baseline.yaml, or where the twin has one; it replaces that."""
 
 
 @dataclass(frozen=True)

@@ -12,11 +12,10 @@ from estimators.track import HEALTH_NAMES, STALE
 from ..engine.watchdog import interruptible
 from ..format_time import duration_text
 from ..result import to_json
-from ..study.commission import baseline_of, lines, section_file
+from ..study.commission import baseline_of, lines, store_baseline
 from ..study.fold_result import coverage_of
 from ..terminal import complain
 from ..twin.log_reader import read_log
-from ..twin.versions import write_section
 from .prepare import prepared
 
 if TYPE_CHECKING:
@@ -26,7 +25,7 @@ if TYPE_CHECKING:
 def commission_twin(arguments: Arguments) -> int:
     """Carry the command out."""
     # What is normal is told from white innovations, not from what was normal before.
-    twin = prepared(arguments, commissioned="{}")
+    twin = prepared(arguments, baseline="{}")
     log, _ = read_log(twin, arguments.duration)
     fold = twin.fold(log, policy=twin.policy)
     interruptible(fold, fold.advance)
@@ -43,14 +42,13 @@ def commission_twin(arguments: Arguments) -> int:
                 "which the baseline makes normal; fit the tuning (nisus tune) first"
             )
     normals = baseline_of(fold, twin.name, force=arguments.force)
-    text, path = lines(normals), section_file(twin)
-    if arguments.write:
-        write_section(path, "commissioned", text)
+    text = lines(normals)
+    path = store_baseline(twin, text) if arguments.write else None
     if arguments.json:
-        written = str(path) if arguments.write else None
+        written = str(path) if path is not None else None
         head = {"twin": twin.name, "estimator": twin.estimator, "events": log.n, "written": written}
         print(to_json({**head, "commissioned": normals}))
-    elif arguments.write:
+    elif path is not None:
         print(f"{path}: commissioned on {log.n} events of {twin.name}, {twin.estimator}")
     else:
         print(text, end="")

@@ -8,7 +8,8 @@ from pathlib import Path
 
 import numpy as np
 
-from config.loader import TWINS
+from config.old_names import read_yaml
+from config.yaml_files import TWINS, baseline_file, read_text, shown_path, writing
 from estimators.diagnostics.episodes.baseline import Normal, commission, contradictions
 from estimators.diagnostics.score import score
 from estimators.errors import ConfigError
@@ -16,6 +17,7 @@ from estimators.fold import Fold
 from estimators.track import DIVERGED, FAILED, GATED, SCREENED, STALE
 
 from ..twin.twin import Twin
+from ..twin.versions import write_section
 
 MAX_FAULTY_SHARE = 0.1
 """Share of readings refused, of rows lost, or of one value in a row, beyond which data are not in order."""
@@ -26,14 +28,30 @@ MIN_COVERAGE = 0.6
 MAX_EQUAL_RUN = 50  # equal readings in a row that are never too many
 
 
-def section_file(twin: Twin) -> Path:
-    """Return the file that has the baseline: the twin's YAML, or that of its tuning version."""
-    return twin.path if twin.version is None else twin.version.path
+def store_baseline(twin: Twin, section: str) -> Path:
+    """Write the section of a baseline; return its file.
+
+    It is that of the twin's tuning version, the twin's own if that has the section, else NAME.baseline.yaml beside it.
+
+    Raises:
+        ConfigError: If it cannot be written.
+    """
+    path = baseline_file(twin.path)
+    if twin.version is not None:
+        path = twin.version.path
+    elif "baseline" in read_yaml(read_text(twin.path, "nisus twins"), shown_path(twin.path))[1]:
+        path = twin.path
+    if path.is_file():
+        write_section(path, "baseline", section)
+    else:
+        with writing(path):
+            path.write_text(section, encoding="utf-8")
+    return path
 
 
 def storable(twin: Twin) -> bool:
     """Return whether the page may store a baseline: the twin is a file of the user's own, not a recording."""
-    path = section_file(twin)
+    path = twin.path if twin.version is None else twin.version.path
     own = path.suffix in (".yaml", ".yml") and path.is_file() and TWINS not in path.absolute().parents
     return own and not twin.recorded
 
@@ -91,7 +109,7 @@ def lines(normals: Mapping[str, Normal]) -> str:
     """
     if not normals:
         raise ConfigError("no sensor row has 50 readings that were judged; commission on a longer recording")
-    text = "commissioned:                    # what was normal when this tuning was accepted (nisus commission)\n"
+    text = "baseline:                        # what was normal when this tuning was accepted (nisus commission)\n"
     for name, normal in normals.items():
         reached = ", ".join(f"{cause}: {peak:g}" for cause, peak in normal.reached.items())
         nis = f", nis: {normal.nis:g}" if normal.nis else ""

@@ -22,10 +22,10 @@ def commissioned(loaded: Loaded, model: StateSpaceModel) -> dict[str, Normal]:
     Raises:
         ConfigError: With file and line, if it names what the model or the bank lacks.
     """
-    given = loaded.config.commissioned
-    check_names(loaded, ("commissioned",), given, model.row_names, "sensor row", model)
+    given = loaded.config.baseline
+    check_names(loaded, ("baseline",), given, model.row_names, "sensor row", model)
     for name, section in given.items():
-        check_names(loaded, ("commissioned", name, "reached"), section.reached, ALARM_NAMES, "alarm", model)
+        check_names(loaded, ("baseline", name, "reached"), section.reached, ALARM_NAMES, "alarm", model)
     return {
         name: Normal(section.bias, section.scale, section.correlation, section.reached, section.nis, section.forced)
         for name, section in given.items()

@@ -18,7 +18,7 @@ from config.old_names import new_overrides
 from config.schema import TwinSection
 from config.source_schema import AssetSection
 from config.tunings import OWN_VALUES, Version, find_version
-from config.yaml_files import parse
+from config.yaml_files import baseline_file, parse
 from estimators.diagnostics.episodes.baseline import baseline_of, lost_from
 from estimators.diagnostics.health import HealthPolicy
 from estimators.errors import LARGEST, ConfigError, EstimatorError
@@ -82,9 +82,9 @@ class Twin:
 
     @property
     def files(self) -> tuple[Path, ...]:
-        """Files of the twin: its YAML, its tuning version, the user's files of its model and correction."""
+        """Files of the twin: its YAML, its baseline, its tuning version, the user's of its model and correction."""
         version = () if self.version is None else (self.version.path,)
-        return (self.path, *version, *model_files(self.loaded))
+        return (self.path, baseline_file(self.path), *version, *model_files(self.loaded))
 
     @property
     def name(self) -> str:
@@ -147,7 +147,7 @@ class Twin:
     @property
     def forced_baseline(self) -> str:
         """Why the log of its baseline contradicted it, if it was accepted with --force; "" otherwise."""
-        return next((item.forced for item in self.config.commissioned.values() if item.forced), "")
+        return next((item.forced for item in self.config.baseline.values() if item.forced), "")
 
     @property
     def tells_field(self) -> bool:
@@ -204,7 +204,7 @@ def load_twin(
         ConfigError: If the YAML, the version or an override breaks a rule.
         ModelError: If the model's file fails.
     """
-    overrides = new_overrides(overrides or {})
+    overrides = new_overrides(overrides or {}, tell=True)
     named = {key: value for key, value in overrides.items() if key == VERSION}
     return _assemble(load(name_or_path, _of_yaml(overrides) | named), overrides, log_files)
 

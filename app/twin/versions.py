@@ -156,9 +156,9 @@ def version_text(twin: Twin, given: Settings) -> str:
         evidence=given.evidence,
     )
     heading = f"# A tuning version of {twin.name}; `nisus tunings` lists, compares and accepts them.\n"
-    baseline = {} if given.tuning.baseline is None else twin.config.commissioned
+    baseline = {} if given.tuning.baseline is None else twin.config.baseline
     normal = {name: section.model_dump(mode="json", exclude_unset=True) for name, section in baseline.items()}
-    more = (*as_section("withhold", twin.config.withhold), *as_section("commissioned", normal))
+    more = (*as_section("withhold", twin.config.withhold), *as_section("baseline", normal))
     values = tuning_yaml(twin.config, given.estimator, given.tuning, given.prior, whole=False, widths=given.widths)
     return heading + _header(head) + values + "".join(f"{line}\n" for line in more)
 

@@ -32,11 +32,11 @@ from ..render.html import to_html
 from ..render.report import Reported, report
 from ..render.runs_json import changes_json, noise_json, runs_json, swept_json, what_changed
 from ..render.track_file import KINDS, encoded, rows_of_run, tables
-from ..study.commission import baseline_of, lines, section_file, storable
+from ..study.commission import baseline_of, lines, storable, store_baseline
 from ..twin.changes import difference
 from ..twin.tuning_yaml import tuning_yaml
 from ..twin.twin import with_version
-from ..twin.versions import Settings, figures, keep, listing, verdicts, version_text, write_section
+from ..twin.versions import Settings, figures, keep, listing, verdicts, version_text
 from .http import OneAtATime, get, post
 
 MAX_ERRORS = 6
@@ -229,7 +229,7 @@ def commission_running(engine: Engine, *, force: bool) -> Path:
     """Write the baseline of the running tuning over its whole history into the twin's file; return the file.
 
     Raises:
-        ConfigError: If the tuning has edits that the file does not have, or as `baseline_of` and `write_section`.
+        ConfigError: If the tuning has edits that the file does not have, or as `baseline_of` and `store_baseline`.
     """
     twin, (tuning, estimator) = engine.twin, engine.folded_with()
     if not storable(twin):
@@ -239,5 +239,4 @@ def commission_running(engine: Engine, *, force: bool) -> Path:
     log, base = copy_log(engine, tuning)
     fold = folded(estimator, engine.model, replace(tuning, baseline=None), log, policy=engine.policy, base=base)
     normals = baseline_of(fold, twin.name, force=force, option="Store anyway")
-    write_section(section_file(twin), "commissioned", lines(normals))
-    return section_file(twin)
+    return store_baseline(twin, lines(normals))

@@ -151,7 +151,7 @@ def test_overrides_replace_values_and_errors_name_the_option():
         loaded.config.source.duration == 5.0 and loaded.config.time.predict_every == 0.1 and loaded.config.gate is None
     )
     said = message(MOTOR, {"time.tock.x": "5"})
-    assert said.startswith("--set time.tock.x=5: time.tock is not known; did you mean late?")
+    assert said.startswith("--set time.tock.x=5: time.tock is not known; choose from max_delay, ")
 
 
 @cases(__file__, "refused_overrides.csv")

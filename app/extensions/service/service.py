@@ -26,6 +26,7 @@ from app.web.gate import USER, User
 from app.web.http import PAGE, get, page_file, post, refusal
 from app.web.request_threads import in_thread
 from app.web.viser_proxy import couple
+from config.yaml_files import yaml_files
 from estimators.errors import ConfigError, is_blank, nearest, quoted
 
 from .forward import Forwarded, credentials
@@ -250,9 +251,9 @@ class TwinFolder:
 
     def __call__(self) -> dict[str, str]:
         """Return the present paths of the twins by name."""
-        files = {path for path in self._folder.glob("*") if path.suffix in (".yaml", ".yml") and path.is_file()}
+        files = yaml_files(self._folder)
         self._known = {name: path for name, path in self._known.items() if path in files}
-        for path in sorted(files):
+        for path in files:
             blank = is_blank(path.stem)
             known = path if blank else self._known.setdefault(path.stem, path)
             if (blank or path != known) and path not in self._refused:

@@ -13,6 +13,7 @@ from app.study.commission import lines
 from app.twin.log_reader import read_log
 from app.twin.twin import load_twin
 from app.twin.versions import write_section
+from config.yaml_files import yaml_files
 from estimators.diagnostics.episodes.baseline import Normal, baseline_of, lost_from
 from estimators.errors import ConfigError
 from estimators.fold import fold
@@ -32,7 +33,7 @@ source:
   sensors: {winding: {columns: y}}
 """
 SECTION = """\
-commissioned:                    # of another day
+baseline:                    # of another day
   winding: {bias: 0.5, scale: 2, correlation: 0.1,
 
     # a comment inside
@@ -66,6 +67,37 @@ def test_what_is_printed_is_what_is_read_again(tmp_path, capsys):
     # Against white innovations, not against what was normal before: the same again.
     assert commission_twin(CommissionCommand(path)) == 0
     assert capsys.readouterr().out == printed
+    # What is written stands in a file beside it, which replaces nothing that is written by hand.
+    Path(path).write_text(TWIN)
+    beside = tmp_path / "drive.baseline.yaml"
+    for _ in range(2):
+        assert commission_twin(CommissionCommand(path, write=True)) == 0
+        assert (beside.read_text(), Path(path).read_text()) == (printed, TWIN)
+    twin = load_twin(path)
+    np.testing.assert_array_equal(twin.tuning.baseline, baseline)
+    assert beside in twin.files and twin.text == f"{TWIN}\n{printed}"
+    assert yaml_files(tmp_path) == [Path(path)]
+
+
+@pytest.mark.parametrize(
+    ("own", "beside", "said"),
+    [
+        ("baseline: {}\n", "baseline: {}\n", "drive.yaml:9: baseline stands here and in {}; keep one"),
+        (
+            "",
+            "baseline: {}\ngate: 0.9\n",
+            "{}:1: the file is {{baseline: a mapping, gate: 0.9}}; it must hold the section",
+        ),
+        ("", "text", "{}:1: the file is 'text'; it must hold the section `baseline` alone; write it anew"),
+        ("", "\nbaseline:\n  tooth: {}\n", "{}:3: baseline.tooth is no sensor row of motor_winding"),
+        ("", "baseline: {winding: {scale: 0}}", "{}:1: baseline.winding.scale is 0; it must be positive"),
+    ],
+)
+def test_what_is_wrong_with_the_file_beside_it_is_one_line(tmp_path, monkeypatch, own, beside, said):
+    path = drive(tmp_path, TWIN + own)
+    (tmp_path / "drive.baseline.yaml").write_text(beside)
+    monkeypatch.chdir(tmp_path)
+    assert error_of(ConfigError, load_twin, path).startswith(said.format("drive.baseline.yaml"))
 
 
 def test_bands_that_hold_too_little_are_told(tmp_path, capsys):
@@ -87,15 +119,15 @@ def test_every_figure_comes_back(tmp_path):
 @pytest.mark.parametrize("end", ["\n", "\r\n"], ids=["unix", "windows"])
 @pytest.mark.parametrize(
     "text",
-    [TWIN, TWIN + SECTION, TWIN + SECTION + REST, SECTION + TWIN, TWIN + SECTION.rstrip("\n"), TWIN + "\n" + SECTION],
-    ids=["none", "last", "amidst", "first", "unended", "apart"],
+    [TWIN + SECTION, TWIN + SECTION + REST, SECTION + TWIN, TWIN + SECTION.rstrip("\n"), TWIN + "\n" + SECTION],
+    ids=["last", "amidst", "first", "unended", "apart"],
 )
 def test_the_rest_of_the_file_stays(tmp_path, text, end):
     """Byte for byte, with line ends as they are; and written again it is the same."""
     path = Path(drive(tmp_path, text.replace("\n", end)))
     assert commission_twin(CommissionCommand(str(path), write=True)) == 0
     written = path.read_bytes()
-    first = written.index(b"commissioned:")
+    first = written.index(b"baseline:")
     # Two lines of its own: the key, and a row with what was reached.
     own = b"".join(written[first:].splitlines(keepends=True)[:3])
     assert own.endswith(b"}}" + end.encode())
@@ -118,18 +150,18 @@ def test_too_little_is_one_line(tmp_path):
 
 def test_a_file_that_cannot_be_written_is_one_line(tmp_path):
     with pytest.raises(ConfigError, match=r"absent\.yaml: cannot be written: No such file or directory; "):
-        write_section(tmp_path / "absent.yaml", "commissioned", "commissioned: {}\n")
+        write_section(tmp_path / "absent.yaml", "baseline", "baseline: {}\n")
 
 
 @cases(__file__, "wrong_baselines.csv")
 def test_a_wrong_section_is_one_line(tmp_path, section, said):
-    path = drive(tmp_path, TWIN + "commissioned:\n" + section)
+    path = drive(tmp_path, TWIN + "baseline:\n" + section)
     assert said in error_of(ConfigError, load_twin, path)
 
 
 def test_a_twin_is_commissioned_against_white_innovations_whatever_was_normal_before(tmp_path):
     """Readings twenty times as noisy as R says are no longer diverged once that was normal; they are if told anew."""
-    path = drive(tmp_path, TWIN + "commissioned:\n  winding: {scale: 50}\n", noise=40.0)
+    path = drive(tmp_path, TWIN + "baseline:\n  winding: {scale: 50}\n", noise=40.0)
     twin, log = recorded(path)
 
     def lost(tuning):

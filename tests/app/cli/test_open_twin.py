@@ -68,7 +68,7 @@ source:
   duration: 120
   seed: 3
   faults: [{kind: bias, sensor: winding, size: 30, start: 60, end: 90}]
-commissioned:
+baseline:
   winding: {bias: 1.0, scale: 2.0, correlation: 0.3}
 """
 
@@ -94,7 +94,7 @@ def test_a_review_judges_as_the_run_did(overrides, tmp_path):
     assert_same(judged(again, log, kept.base)[0], track)
     # And what is compared does depend on what was left out before.
     if overrides or twin.tuning.baseline is not None:
-        bare = load_twin(yaml, overrides={"commissioned": "{}"} if not overrides else {})
+        bare = load_twin(yaml, overrides={"baseline": "{}"} if not overrides else {})
         assert judged(bare, log)[1] != told
 
 

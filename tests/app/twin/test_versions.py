@@ -299,7 +299,7 @@ def test_the_name_is_in_every_row_and_recording(winding, tmp_path):
     twin = load_twin(winding)
     tuning = replace(twin.tuning.set("Q.rate", 1e-4))
     settings = Settings("kf", tuning, prior=(twin.model.prior_mean, np.diag([25, 0.49])))
-    keep(twin, "tried", version_text(twin, settings) + "commissioned:\n  winding: {bias: 0.25}\n")
+    keep(twin, "tried", version_text(twin, settings) + "baseline:\n  winding: {bias: 0.25}\n")
     fold_twin(FoldCommand(str(winding), tuning="tried", out=tmp_path / "a.parquet"))
     assert set(pyarrow.parquet.read_table(tmp_path / "a.parquet").column("tuning").to_pylist()) == {"tried"}
     fold_twin(FoldCommand(str(winding), tuning="tried", out=tmp_path / "a.rrd"))

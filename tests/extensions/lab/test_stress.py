@@ -275,7 +275,7 @@ def test_a_wrong_belief_over_a_recording_is_foretold_by_what_follows(data):
     data("battery_panasonic_18650pf", "25degC_US06.mat")
     # Without the errors that last, and with what was normal then.
     overrides = WHITE_NOISE | {
-        "commissioned": """{voltage: {bias: 0.002, scale: 0.372, correlation: 0.609,
+        "baseline": """{voltage: {bias: 0.002, scale: 0.372, correlation: 0.609,
           reached: {narrow: 295.4, wide: 3524.3, shifted up: 211.4, shifted down: 229.5, correlated: 997.6,
           alternating: 522.3, spiky: 2106.5, stuck: 237.6}},
           temperature: {bias: 0.008, scale: 1.004, correlation: 0.683,

@@ -22,7 +22,7 @@ from config.companion_schema import AcceptedSection
 from config.loader import find, shipped
 from config.source_schema import SimulatorSection
 from config.tunings import OWN_VALUES, Version, folders, load_version, named, ships, version_files
-from config.yaml_files import shown_path
+from config.yaml_files import shown_path, yaml_files
 from estimators.errors import ConfigError, NisusError, SourceError, printable
 from estimators.fold import Fold
 from estimators.log import Log
@@ -114,7 +114,7 @@ def of_folder(folder: Path) -> list[GuardedLog]:
     Raises:
         ConfigError: If there are none.
     """
-    twins = [of_twin(str(path)) for path in sorted(folder.glob("*.yaml")) if not path.name.endswith(SUFFIX)]
+    twins = [of_twin(str(path)) for path in yaml_files(folder) if not path.name.endswith(SUFFIX)]
     recordings = [_of_recording(path) for path in sorted(folder.glob("*.rrd"))]
     if not twins and not recordings:
         raise ConfigError(f"--archive {folder}: holds no recording (.rrd) and no twin (.yaml); name their folder")

@@ -256,16 +256,17 @@ def test_a_twin_of_ones_own_stores_its_baseline(visit, tmp_path, capsys):
         section = page.get_by_role("region", name="Baseline")
         section.get_by_role("button", name="Store baseline").click()
         section.get_by_text("has been edited; save it first").wait_for()
-        assert "commissioned" not in path.read_text()
+        beside = path.with_name("drive.baseline.yaml")
+        assert not beside.exists()
         session.engine.submit(Load(0))
         wait_for(lambda: session.engine.folded_with()[0].get("Q.rate") != 0.02)
         section.get_by_role("button", name="Store baseline").click()
         wait_for(lambda: session.engine.folded_with()[0].baseline is not None)
         # What `nisus commission` prints for the file.
-        stored = path.read_text().partition("commissioned:")[2]
+        stored = beside.read_text()
         assert commission_twin(CommissionCommand(str(path))) == 0
-        assert capsys.readouterr().out.partition("commissioned:")[2] == stored and "scale: 1.275" in stored
-        section.get_by_text("Stored in drive.yaml").wait_for()
+        assert capsys.readouterr().out.endswith(stored) and "scale: 1.275" in stored
+        section.get_by_text("Stored in drive.baseline.yaml").wait_for()
         assert section.get_by_role("button").count() == 0
         wait_for(lambda: session.engine.status().health == TRACKING)
 

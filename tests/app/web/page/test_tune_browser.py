@@ -6,7 +6,7 @@ import pytest
 
 from app.twin.twin import load_twin
 from app.web.twin_json import model_json
-from config.loader import TWINS
+from config.yaml_files import shipped
 
 pytestmark = pytest.mark.browser
 
@@ -41,7 +41,7 @@ BUILD = """async (model) => {
 @pytest.fixture(scope="module")
 def models():
     """What the page gets of each bundled twin, by its name."""
-    twins = {path.stem: load_twin(path) for path in sorted(TWINS.glob("*.yaml"))}
+    twins = {name: load_twin(name) for name in shipped()}
     return {
         name: model_json(SimpleNamespace(model=twin.model, twin=twin, pairs=twin.pairs)) for name, twin in twins.items()
     }
