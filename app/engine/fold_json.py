@@ -14,17 +14,22 @@ from estimators.model.state_space import StateSpaceModel
 from estimators.snapshots import Base
 from estimators.tuning import Tuning
 
+ENSEMBLES = ("enkf", "etkf", "ensrf", "letkf")
+
 
 def tuning_to_json(tuning: Tuning, estimator: str) -> str:
     """Return a tuning and its estimator as text, which keeps float64 exactly."""
     arrays = {name: getattr(tuning, name).tolist() for name in ("q", "r", "p", "used")}
     plain = {name: getattr(tuning, name) for name in ("gate", "gate_kind", "reopen", "seed", "name")}
-    return json.dumps({"estimator": estimator, **arrays, **plain, "options": dict(tuning.options)})
+    members = {"members": 200} if estimator in ENSEMBLES else {}
+    return json.dumps({"estimator": estimator, **arrays, **plain, "options": dict(tuning.options), **members})
 
 
 def tuning_from_json(text: str, model: StateSpaceModel) -> tuple[Tuning, str]:
     """Return the tuning and the estimator that `tuning_to_json` wrote."""
     values = json.loads(text)
+    # In older recordings and stores an ensemble had 50 members by default.
+    former = {"members": 50.0} if "members" not in values and values["estimator"] in ENSEMBLES else {}
     tuning = Tuning(
         model=model,
         q=np.array(values["q"], float),
@@ -35,7 +40,7 @@ def tuning_from_json(text: str, model: StateSpaceModel) -> tuple[Tuning, str]:
         # In older recordings the gate was hard and never reopened.
         gate_kind=values.get("gate_kind", "hard"),
         reopen=values.get("reopen"),
-        options=values["options"],
+        options=former | values["options"],
         seed=values["seed"],
         name=values.get("name", ""),
     )

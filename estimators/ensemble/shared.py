@@ -60,7 +60,8 @@ THREADED_FROM = 65_536
 """Numbers in an ensemble from which threads gain more than they cost."""
 
 
-MEMBERS = Option("members", 50, 2, 10_000, "", "number of members")
+MEMBERS = Option("members", 200, 2, 10_000, "", "number of members")
+"""The chance spread of 50 members costs a tenth of the coverage of a band; a state of any size is cheap with 200."""
 
 
 INFLATE = Option("inflation", 1.0, 1.0, 10.0, "", "factor on the anomalies after each reading that is used")
