@@ -370,9 +370,10 @@ def _as_pairs(value: Any) -> Any:
 
 
 Ranges = Annotated[
-    tuple[Interval, ...],
+    tuple[Pair, ...],
     Field(min_length=1),
     BeforeValidator(_as_pairs, json_schema_input_type=Pair | list[Pair]),
+    AfterValidator(lambda pairs: tuple(map(_rising, pairs))),
 ]
 
 

@@ -32,6 +32,8 @@ RENAMED: dict[tuple[str | None, ...], str] = {
     ("time", "tick"): "predict_every",
     ("view", "at"): "cursor",
     ("sensors", ANY, "at"): "landmarks",
+    ("parameters", ANY, "use"): "role",
+    **{(group, ANY, kind, "use"): "role" for group in ("sensors", "inputs") for kind in ("offset", "scale")},
     ("sensors", ANY, "error", "over"): "correlation_time",
     ("noise", ANY, "over"): "correlation_time",
     **{(*channel, "where"): "valid_if" for channel in CHANNELS},

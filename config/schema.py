@@ -100,24 +100,24 @@ class ParameterSection(Section):
     widen: dict[str, WidenSection] = {}
     """Growth of its uncertainty outside the fitted range (`valid_range`) of states and inputs, by their names, as in
     {temperature: {per: 10, by: 50 %}}. Default: none."""
-    use: Literal["held", "considered", "estimated"] = "considered"
+    role: Literal["held", "considered", "estimated"] = "considered"
     """held: the filter takes it for certain. considered: no measurement changes it, and its uncertainty is part of the
     bands (Schmidt's filter). estimated: it becomes a state, as with `estimate`. Default: considered, if it has a
     std or widens."""
 
     @model_validator(mode="after")
     def _complete(self) -> ParameterSection:
-        if self.use == "estimated" and self.std is None:
+        if self.role == "estimated" and self.std is None:
             raise refused("absent", "is estimated and needs the standard deviation of its prior", "std")
-        if self.use != "estimated" and self.drift:
-            raise refused("relation", "is for a parameter with `use: estimated`; leave it out", "drift")
-        if "use" in self.model_fields_set and self.use == "considered" and self.std is None and not self.widen:
+        if self.role != "estimated" and self.drift:
+            raise refused("relation", "is for a parameter with `role: estimated`; leave it out", "drift")
+        if "role" in self.model_fields_set and self.role == "considered" and self.std is None and not self.widen:
             raise refused("absent", "is considered and needs a standard deviation, as in std: 10 %", "std")
         return self
 
     def spread(self, value: float) -> float | None:
         """Return the standard deviation of a parameter of this value; None if it is held."""
-        if self.use == "held" or (self.std is None and not self.widen):
+        if self.role == "held" or (self.std is None and not self.widen):
             return None
         return 0.0 if self.std is None else as_width(value, self.std)
 
@@ -149,10 +149,10 @@ class InstrumentSection(Section):
     """Offset and scale of a sensor or an input."""
 
     offset: OptionalParameter = None
-    """Added offset: a value, or {value, std, use} as a parameter, as in {std: 0.005}, in its unit. It becomes the
+    """Added offset: a value, or {value, std, role} as a parameter, as in {std: 0.005}, in its unit. It becomes the
     parameter NAME_offset (NAME_ROW_offset of several rows), which `parameters` may give in its place. Default: none."""
     scale: OptionalParameter = None
-    """Scale factor: a value, or {value, std, use} as a parameter, as in {std: 0.2 %}. It becomes the parameter
+    """Scale factor: a value, or {value, std, role} as a parameter, as in {std: 0.2 %}. It becomes the parameter
     NAME_scale (NAME_ROW_scale of several rows). Default: none."""
 
 
@@ -439,7 +439,7 @@ class TwinSection(Section):
     of a function that returns one, in it (./pump.py:Pump). Or {matrices: file, states, inputs, sensors} for a linear
     model, {fmu: file, step, ...} for an FMU."""
     parameters: Parameters = {}
-    """The model's parameters by name: their values, in their units, or {value, std, correlation, widen, use}. Default:
+    """The model's parameters by name: their values, in their units, or {value, std, correlation, widen, role}. Default:
     the model's values, held."""
     correction: Text | None = None
     """File of a learned correction, beside this one, as `nisus learn` writes it: a correction of the model's rates,

@@ -324,7 +324,7 @@ def topics(checked: Checked, checklist: Sequence[ChecklistLine]) -> list[Topic]:
         health.append(f"... and {len(checked.episodes) - MAX_ROWS} more episodes.")
     health += calibration_lines(checked.calibration, twin.model)[: 2 * MAX_ROWS]
     asked = [
-        f"valid.{state.name} leaves out the prior's mean, {state.mean:g}{spaced(state.unit)}: is it in that unit?"
+        f"valid_range.{state.name} leaves out the prior's mean, {state.mean:g}{spaced(state.unit)}: is it in that unit?"
         for state in twin.model.shown_states
         if state.name in twin.config.valid_range and state.fitted and is_outside(state, state.mean)
     ]

@@ -156,7 +156,7 @@ def width_priors(config: TwinSection, model: StateSpaceModel, wanted: Sequence[s
     found, sections = {}, parameter_sections(model, config)
     for item in model.parameters:
         section = sections.get(item.name, ParameterSection())
-        if item.name in times or section.use != "considered" or "use" in section.model_fields_set and not section.std:
+        if item.name in times or section.role != "considered" or "role" in section.model_fields_set and not section.std:
             continue
         if section.std is not None:
             found[item.name] = as_width(item.value, section.std)

@@ -198,9 +198,9 @@ def _assembled(model: StateSpaceModel, loaded: Loaded) -> StateSpaceModel:
             raise loaded.error(at, f"is {section.std} of {values[name]:g}; give it in the unit of the value")
         if std is not None:
             if name in config.estimate:
-                remedy = f"give it in one place, or set parameters.{name}.use to estimated"
+                remedy = f"give it in one place, or set parameters.{name}.role to estimated"
                 raise loaded.error(("estimate", name), f"has a std in `parameters` too; {remedy}")
-            considered, widened = section.use == "considered", section.widened(values[name])
+            considered, widened = section.role == "considered", section.widened(values[name])
             estimated[name] = JointParameter(std, section.drift, considered, widened)
     for name, section in sections.items():
         check_names(
@@ -217,7 +217,7 @@ def _assembled(model: StateSpaceModel, loaded: Loaded) -> StateSpaceModel:
         raise loaded.error(
             uncertain[name], f"is uncertain, and {model.name} is a field, whose parameters are held; give no std"
         )
-    held = {name for name, section in sections.items() if section.use != "considered"}
+    held = {name for name, section in sections.items() if section.role != "considered"}
     correlations = {
         (name, other): value
         for name, section in sections.items()
@@ -245,7 +245,7 @@ def _assembled(model: StateSpaceModel, loaded: Loaded) -> StateSpaceModel:
         if kind == "learned":
             raise ConfigError(f"{learned_place}: {error}") from None
         keys = {
-            "noise": ("noise", name, "over"),
+            "noise": ("noise", name, "correlation_time"),
             "error": ("sensors", name, "error"),
             "estimate": uncertain.get(name, ()),
             "correlation": ("parameters",),

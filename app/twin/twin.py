@@ -247,7 +247,7 @@ def with_held(twin: Twin) -> Twin:
     if not twin.model.considered:
         return twin
     parameters = {
-        name: section.model_copy(update={"use": "held"}) if section.use == "considered" else section
+        name: section.model_copy(update={"role": "held"}) if section.role == "considered" else section
         for name, section in parameter_sections(twin.model, twin.config).items()
     }
     loaded = replace(twin.loaded, config=twin.config.model_copy(update={"parameters": parameters}))

@@ -282,7 +282,7 @@ def _distances(model: StateSpaceModel, widened: Sequence[Parameter], given: Mapp
             if limits is None:
                 raise ModelError(
                     f"model {model.name}: {item.name} is to widen outside the range of {name}, which has none; give it "
-                    f"under `valid: {{{name}: {{min: ..., max: ...}}}}`"
+                    f"under `valid_range: {{{name}: [low, high]}}`"
                 )
             found.append((names.index(item.name), int(at), float(limits[0]), float(limits[1]), float(width)))
     return tuple(found)

@@ -38,7 +38,7 @@ def check_smooth(estimator: Estimator, model: StateSpaceModel, options: Mapping[
         names = ", ".join(model.state_names[model.nx - model.considered :])
         raise EstimatorError(
             f"{estimator.name} cannot be smoothed: {model.name} considers {names}, and the smoothed estimate may be "
-            "worse than the filtered one; hold (`use: held`) or estimate them to smooth"
+            "worse than the filtered one; hold (`role: held`) or estimate them to smooth"
         )
     if model.black_box:
         raise EstimatorError(f"{estimator.name} cannot be smoothed: {model.name} is a black box, which is not compiled")

@@ -59,7 +59,7 @@ def random_walk(n, seed=1, step=0.1):
 
 
 def twin(history=200_000, horizon=2.0, tick=1000.0, model=MODEL, estimator="kf"):
-    time = SimpleNamespace(horizon=horizon, degraded_after=5.0, stale_after=30.0, tick=tick)
+    time = SimpleNamespace(max_delay=horizon, degraded_after=5.0, stale_after=30.0, predict_every=tick)
     parts = {
         "parameters": {},
         "noise": {},

@@ -76,7 +76,7 @@ def test_where_is_proposed_for_columns_of_quality(tmp_path, nisus):
     rows = "0,1,Good,192,OK\n1,2,Bad,0,Run\n2,3,Uncertain,64,OK\n"
     (tmp_path / "a.csv").write_text(f"t,x,Status,Quality,State\n{rows}")
     text = " ".join(nisus("log", str(tmp_path / "a.csv")).out.split())
-    for condition in ('{"Status": ["Good"]}', '{"Quality": {"min": 192}}'):
+    for condition in ('{"Status": ["Good"]}', '{"Quality": [192, null]}'):
         assert f"(rows: 2); to leave these rows out give valid_if: {condition}" in text
     assert text.count(" valid_if: ") == 2
 

@@ -132,8 +132,11 @@ def test_a_store_of_the_version_before_is_continued_with_its_source(path):
     with closing(sqlite3.connect(path, isolation_level=None)) as file:
         parts = dict(file.execute("SELECT kind, data FROM parts WHERE kind IN ('twin', 'state')").fetchall())
         twin, state = (json.loads(parts[kind]) for kind in ("twin", "state"))
-        assert "  max_delay: 2.0  " in twin["yaml"]
-        twin |= {"yaml": twin["yaml"].replace("max_delay:", "horizon:"), "overrides": {"time.tick": "0.5"}}
+        assert "\ntime:\n" in twin["yaml"]
+        twin |= {
+            "yaml": twin["yaml"].replace("\ntime:\n", "\ntime:\n  horizon: 2\n"),
+            "overrides": {"time.tick": "0.5"},
+        }
         state["source"] = f"(SimulatorSection(where={{}}), {state['source']})"
         for kind, value in ("twin", twin), ("state", state):
             data = json.dumps(value).encode()

@@ -235,8 +235,8 @@ def test_offsets_and_scales_are_parameters_of_the_instruments():
     drive = MOTOR.replace("motor_winding", "motor_drive").replace("estimator: kf\n", "")
     drive = drive[: drive.index("prior:")] + (
         "sensors:\n  winding: {offset: {std: 0.5}, scale: {value: 1.01, std: 0.2 %}}\n  tooth: {offset: 0.3}\n"
-        "inputs:\n  coolant: {offset: {std: 2, use: estimated, drift: 0.1}}\n"
-        "parameters: {winding_offset: 0.1, tooth_offset: {std: 0.4, use: held}}\nsource: {type: simulator}\n"
+        "inputs:\n  coolant: {offset: {std: 2, role: estimated, drift: 0.1}}\n"
+        "parameters: {winding_offset: 0.1, tooth_offset: {std: 0.4, role: held}}\nsource: {type: simulator}\n"
     )
     model = twin_of(drive).model
     own = {item.name: item.value for item in model.parameters}

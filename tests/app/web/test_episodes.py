@@ -9,7 +9,7 @@ import pytest
 
 from app.engine.engine import Engine
 from app.web.twin_json import episodes_json, status_json
-from tests.app.scripted import Scripted, readings, twin
+from tests.app.scripted import Scripted, fresh_status, readings, twin
 from tests.waiting import LIMIT_S, wait_for
 
 ROOT = Path(__file__).parents[3]
@@ -33,7 +33,7 @@ def test_a_stuck_sensor_in_the_api(engine):
     y[100:] = 41.5
     engine._accept([readings(1.0 + np.arange(200), y)])
     engine._watchers.episode_log.update()
-    engine._status = None
+    fresh_status(engine)
     (episode,) = strict(episodes_json(engine))
     assert " ".join(episode) == "start end subject cause size low high unit text grade help severity"
     # The first of the equal readings is that at 101 s; what is stuck has a value, and no interval of it.

@@ -316,7 +316,7 @@ def test_shares_of_the_variance_are_those_of_refolds(estimator):
 
 def test_a_smoother_refuses_what_is_considered():
     model = joint(physics(f), CONSIDERED)
-    with pytest.raises(EstimatorError, match="considers offset_deviation, loss_deviation.*use: held"):
+    with pytest.raises(EstimatorError, match="considers offset_deviation, loss_deviation.*role: held"):
         check_smooth(find_estimator("ekf", model), model, {})
 
 

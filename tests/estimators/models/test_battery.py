@@ -131,7 +131,7 @@ def test_lost_capacity_is_found_when_it_is_estimated() -> None:
     twin = load_twin(
         "battery_pack",
         overrides={
-            "parameters": "{r0_5: 0.042, capacity_5: {std: 0.3, use: estimated}}",
+            "parameters": "{r0_5: 0.042, capacity_5: {std: 0.3, role: estimated}}",
             "noise.soc": "{variance: 1e-11}",
             "noise.v1": "{variance: 1e-7}",
         },

@@ -67,7 +67,7 @@ def test_what_is_wrong_has_its_line(before, after, said):
 
 
 def test_a_file_that_is_not_there():
-    assert refusal(TWIN).startswith("motor.yaml:2: learned is 'correction.yaml'; there is no file")
+    assert refusal(TWIN).startswith("motor.yaml:2: correction is 'correction.yaml'; there is no file")
 
 
 def test_a_page_looks_at_it_too():
