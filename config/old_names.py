@@ -18,6 +18,8 @@ from typing import Any
 
 import yaml
 
+from estimators.errors import ConfigError
+
 from .yaml_files import MERGE, Key, ValuePlaces, composed, dotted, end_of, parse, writing
 
 ANY = None
@@ -94,9 +96,9 @@ def read_yaml(text: str, file: str) -> tuple[str, Any, ValuePlaces]:
     lines = places.lines
     text = _edited(text, edits)
     data, places = parse(text, file)
-    named = {key[-1]: (line, new_key(key)[-1]) for key, line in lines.items() if new_key(key)[-1:] != key[-1:]}
-    places.older = [f"{old} (line {line}) is {new} now" for old, (line, new) in named.items()]
-    if any(_is_old(key) and key[-1] in ("min", "max", "from", "to") for key in lines):
+    named = {key[-1]: (line, new_key(key)[-1]) for key, line in lines.items() if _is_old(key)}
+    places.older = [f"{old} (line {line}) is {new} now" for old, (line, new) in named.items() if old != new]
+    if len(named) > len(places.older):
         places.older.append("an interval is [low, high] now")
     return text, data, places
 
@@ -106,7 +108,8 @@ def rewritten(text: str, key: Key = ()) -> str:
 
     What is no YAML stays as it is.
     """
-    with suppress(yaml.YAMLError):
+    with suppress(ConfigError):
+        parse(text, "")
         return _edited(text, dict(_edits(composed(text), key, text)))
     return text
 
@@ -146,12 +149,17 @@ def _tell(text: str) -> None:
         logging.getLogger("nisus").warning(text)
 
 
+WORDS = {way[-1] for way in RENAMED} | {"min", "max", "from", "to"}
+
+
 def _is_old(key: Key) -> bool:
+    if not key or key[-1] not in WORDS:
+        return False
     if key[-1:] in (("min",), ("max",)):
         return _like(new_key(key[:-1]), INTERVALS) is not None
     if key[-1:] in (("from",), ("to",)):
         return _like(key[:-1], BOUNDED) is not None
-    return new_key(key[-1:] if len(key) == 1 else key) != key
+    return new_key(key) != key
 
 
 def _edited(text: str, edits: dict[int, tuple[int, str]]) -> str:

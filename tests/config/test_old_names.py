@@ -104,7 +104,10 @@ def test_a_key_of_the_version_before_is_one_of_this_one_where_it_was_one(old, ne
 
 
 def test_what_is_no_mapping_of_the_version_before_loses_nothing():
-    for text in ("valid: {soc: {min: 0, mox: 1}}", "learned: {file: a}", "valid: [", "noise: {a: {over: {b: 1}}}"):
+    bomb = "a: &a0 {b: 1}\n" + "".join(f"a{k}: &a{k} [{', '.join([f'*a{k - 1}'] * 9)}]\n" for k in range(1, 12))
+    nested = "[" * 2000, "&a [*a]", "{[1]: 2}", bomb
+    wrong = "valid: {soc: {min: 0, mox: 1}}", "learned: {file: a}", "valid: [", "noise: {a: {over: {b: 1}}}"
+    for text in (*wrong, *nested):
         new = rewritten(text)
         assert sorted(new.replace("valid_range", "valid").replace("correlation_time", "over")) == sorted(text)
 
