@@ -76,7 +76,7 @@ def new_key(key: Key) -> Key:
 
 
 def new_overrides(overrides: Mapping[str, str], *, tell: bool = False) -> dict[str, str]:
-    """Return the values of `--set` by the names and notations of this version; `tell` says which are older."""
+    """Return the values of `--set` by the names and notations of this version; older ones are told with `tell`."""
     ways = {key: new_key(tuple(key.split("."))) for key in overrides}
     for key, way in ways.items():
         if tell and key != dotted(way):
@@ -106,7 +106,7 @@ def read_yaml(text: str, file: str) -> tuple[str, Any, ValuePlaces]:
 def rewritten(text: str, key: Key = ()) -> str:
     """Return the text of the value at `key`, or of a file, by the names and notations of this version.
 
-    What is no YAML stays as it is.
+    Text that is no YAML stays as it is.
     """
     with suppress(ConfigError):
         parse(text, "")
