@@ -348,7 +348,7 @@ def test_a_whole_fold_of_a_black_box_that_fails_is_an_error():
     model = switch.model()
     compile_model(model)
     switch.off = {"f"}
-    with pytest.raises(ModelError, match="f fails on a block of 50 states: OSError.*return NaN in the rows of states"):
+    with pytest.raises(ModelError, match="f fails on a block of 200 states: OSError.*return NaN in the rows of states"):
         fold("enkf", model, Tuning.of(model), some_log(5))
 
 
