@@ -85,7 +85,7 @@ class ValuePlaces:
     lines: dict[Key, int] = field(default_factory=dict)
     options: dict[Key, str] = field(default_factory=dict)
     older: list[str] = field(default_factory=list)
-    """What has names of an earlier version; see `old_names`."""
+    """Names of the version before, in words; see `old_names`."""
 
     def at(self, key: Key) -> str:
         """Return the place of `key`, or of the nearest section around it that the file has."""

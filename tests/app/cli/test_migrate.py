@@ -23,3 +23,14 @@ def test_migrate_rewrites_a_twin_and_its_versions_and_keeps_the_files(tmp_path, 
     again = nisus("migrate", "cell.yaml").out
     assert again == "cell.yaml: nothing to do\ncell.tunings/a.yaml: nothing to do\n"
     assert nisus("migrate", "motor_bench", "--json").json[0]["older"] == []
+    # A file that is wrong is left, and the rest goes on.
+    Path("bad.yaml").write_text("time: {horizon: 1, max_delay: 2}")
+    Path("late.yaml").write_text(OLD)
+    found = nisus.run("migrate", "bad.yaml", "none.yaml", "late.yaml")
+    assert (
+        found.status == 2
+        and found.err.count("\n") == 2
+        and "nisus: bad.yaml:1: time.max_delay is given twice" in found.err
+    )
+    assert nisus.refuses("migrate").endswith("no file is named; give at least one")
+    assert found.out.startswith("late.yaml: horizon (line 2) is max_delay now; the file as it was is late.yaml.1.bak")
