@@ -90,16 +90,18 @@ def read_yaml(text: str, file: str) -> tuple[str, Any, ValuePlaces]:
     `places.older` has what was rewritten, in words.
     """
     data, places = parse(text, file)
-    edits = dict(_edits(composed(text), (), text)) if any(_is_old(key) for key in places.lines) else {}
-    if not edits:
-        return text, data, places
     lines = places.lines
-    text = _edited(text, edits)
-    data, places = parse(text, file)
     named = {key[-1]: (line, new_key(key)[-1]) for key, line in lines.items() if _is_old(key)}
-    places.older = [f"{old} (line {line}) is {new} now" for old, (line, new) in named.items() if old != new]
-    if len(named) > len(places.older):
-        places.older.append("an interval is [low, high] now")
+    older = [f"{old} (line {line}) is {new} now" for old, (line, new) in named.items() if old != new]
+    if len(named) > len(older):
+        older.append("an interval is [low, high] now")
+    if ("estimate",) in lines:
+        hand = ", move its entries there by hand" if ("parameters",) in lines else ""
+        older.append(f"estimate is `role: estimated` of an entry of parameters now{hand}")
+    if older:
+        text = rewritten(text)
+        data, places = parse(text, file)
+        places.older = older
     return text, data, places
 
 
@@ -112,6 +114,22 @@ def rewritten(text: str, key: Key = ()) -> str:
         parse(text, "")
         return _edited(text, dict(_edits(composed(text), key, text)))
     return text
+
+
+def joined(data: dict[str, Any], places: ValuePlaces) -> None:
+    """Move the entries of `estimate`, a section of the version before, to those of `parameters`."""
+    given = data.get("estimate")
+    if not isinstance(given, dict) or not isinstance(data.get("parameters") or {}, dict):
+        return
+    del data["estimate"]
+    parameters = data["parameters"] = dict(data.get("parameters") or {})
+    for name, entry in given.items():
+        own = parameters.get(name)
+        own = own if isinstance(own, dict) else {} if own is None else {"value": own}
+        parameters[name] = {**own, **entry, "role": "estimated"} if isinstance(entry, dict) else entry
+    known: Any
+    for known in (places.lines, places.options):
+        known |= {("parameters", *key[1:]): known[key] for key in known if key[:1] == ("estimate",)}
 
 
 def tell_older(places: ValuePlaces) -> None:
@@ -190,6 +208,15 @@ def _edits(node: Any, key: Key, text: str) -> Iterator[tuple[int, tuple[int, str
         if name.value == MERGE and not name.style:
             for part in item.value if isinstance(item, yaml.SequenceNode) else (item,):
                 yield from _edits(part, key, text)
+            continue
+        if (*key, name.value) == ("estimate",) and "parameters" not in entries and isinstance(item, yaml.MappingNode):
+            yield name.start_mark.index, (name.end_mark.index, "parameters")
+            for _, own in item.value:
+                end = end_of(own) - own.flow_style
+                yield (
+                    end,
+                    (end, ", role: estimated" if own.flow_style else f"\n{'':{own.start_mark.column}}role: estimated"),
+                )
             continue
         new = new_key((*key, name.value))
         if new[-1] != name.value and (new != ("correction",) or isinstance(item, yaml.ScalarNode)):

@@ -102,8 +102,8 @@ class ParameterSection(Section):
     {temperature: {per: 10, by: 50 %}}. Default: none."""
     role: Literal["held", "considered", "estimated"] = "considered"
     """held: the filter takes it for certain. considered: no measurement changes it, and its uncertainty is part of the
-    bands (Schmidt's filter). estimated: it becomes a state, as with `estimate`. Default: considered, if it has a
-    std or widens."""
+    bands (Schmidt's filter). estimated: it becomes one of the last states (joint
+    estimation), and may be named like any state. Default: considered, if it has a std or widens."""
 
     @model_validator(mode="after")
     def _complete(self) -> ParameterSection:
@@ -156,19 +156,10 @@ class InstrumentSection(Section):
     NAME_scale (NAME_ROW_scale of several rows). Default: none."""
 
 
-class EstimateSection(Section):
-    """A parameter of the model that is estimated jointly with the state."""
-
-    std: Positive
-    """Standard deviation of its prior about its value, in its unit."""
-    drift: NotNegative = 0.0
-    """Random walk: standard deviation that one second adds, in its unit. Default: 0, an unknown constant."""
-
-
 class RefitSection(Section):
     """Dual estimation: parameters are fitted again on recent windows of the log while the filter estimates the state.
 
-    In joint estimation (`estimate`) one filter estimates both.
+    In joint estimation (`role: estimated`) one filter estimates both.
     """
 
     entries: Texts
@@ -444,9 +435,6 @@ class TwinSection(Section):
     correction: Text | None = None
     """File of a learned correction, beside this one, as `nisus learn` writes it: a correction of the model's rates,
     with a noise NAME_learned for each corrected state. Default: none, the model alone."""
-    estimate: dict[str, EstimateSection] = {}
-    """Joint estimation: parameters that are estimated with the state, by name: {std, drift}. They become the last
-    states and may be named like any state. Default: none."""
     refit: RefitSection | None = None
     """Dual estimation: parameters that are fitted periodically on recent measurements while the twin runs: {entries,
     every, window, adopt}. Default: never."""

@@ -27,16 +27,17 @@ def migrate(arguments: Arguments) -> int:
     for path in dict.fromkeys(file for twin in twins for file in (twin, *version_files(twin).values())):
         name = shown_path(path)
         try:
-            _, _, places = read_yaml(read_text(path, "nisus twins"), name)
-            kept = rewrite(path, lambda text: text) if places.older else None
+            text = read_text(path, "nisus twins")
+            new, _, places = read_yaml(text, name)
+            kept = rewrite(path, lambda text: text) if new != text else None
         except ConfigError as error:
             complain(error)
             status = 2
             continue
         files.append({"file": name, "older": places.older, "kept": kept and shown_path(kept)})
         if not arguments.json:
-            done = f"{', '.join(places.older)}; the file as it was is {shown_path(kept)}" if kept else "nothing to do"
-            print(f"{name}: {done}")
+            done = ", ".join(places.older) or "nothing to do"
+            print(f"{name}: {done}" + (f"; the file as it was is {shown_path(kept)}" if kept else ""))
     if arguments.json:
         print(to_json(files))
     return status

@@ -125,11 +125,9 @@ def check_refit(loaded: Loaded, estimator: str, tuning: Tuning) -> None:
         group, _, rest = name.partition(".")
         if group == "prior":
             raise loaded.error(("refit", "entries"), f"names {name}; a window begins where the filter is, not there")
-        if group == "p" and rest in loaded.config.estimate:
-            raise loaded.error(
-                ("refit", "entries"),
-                f"names {name}, which `estimate` moves into the state; keep it in one of them",
-            )
+        if group == "p" and rest in tuning.model.state_names:
+            text = f"names {name}, which `role: estimated` moves into the state; keep it in one of them"
+            raise loaded.error(("refit", "entries"), text)
         try:
             check_key(estimator, tuning, name)
         except ConfigError as error:

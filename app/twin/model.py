@@ -182,30 +182,24 @@ def _assembled(model: StateSpaceModel, loaded: Loaded) -> StateSpaceModel:
         rows = [row.name for row in model.sensors[model.sensor_names.index(name)].rows]
         key = ("sensors", name, "error", "std" if error.std is not None else "variance")
         errors[name] = ColouredError(one_each(loaded, key, error.variances, rows), error.correlation_time)
-    times = [*map(disturbance_time, noises), *map(error_time, errors)]
     instruments = _instruments(model, loaded)
     sections = parameter_sections(model, config)
     values = {item.name: item.value for item in model.parameters}
     values |= {name: _value(name, section) for name, section in sections.items() if name not in values}
-    check_names(loaded, ("estimate",), config.estimate, [*values, *times], "parameter", model)
-    estimated = {name: JointParameter(section.std, section.drift) for name, section in config.estimate.items()}
+    values |= {disturbance_time(name): seconds for name, seconds in noises.items()}
+    values |= {error_time(name): error.over for name, error in errors.items()}
+    estimated = {}
     own: dict[str, Key] = {name: ("parameters", name) for name in sections} | _instrument_keys(config, instruments)
-    uncertain: dict[str, Key] = {**own, **{name: ("estimate", name) for name in config.estimate}}
     for name, section in sections.items():
         std = section.spread(values[name])
         if std == 0.0 and section.std is not None:
             at: Key = (*own[name], "std")
             raise loaded.error(at, f"is {section.std} of {values[name]:g}; give it in the unit of the value")
         if std is not None:
-            if name in config.estimate:
-                remedy = f"give it in one place, or set parameters.{name}.role to estimated"
-                raise loaded.error(("estimate", name), f"has a std in `parameters` too; {remedy}")
             considered, widened = section.role == "considered", section.widened(values[name])
             estimated[name] = JointParameter(std, section.drift, considered, widened)
     for name, section in sections.items():
-        check_names(
-            loaded, ("parameters", name, "correlation"), section.correlation, [*values, *times], "parameter", model
-        )
+        check_names(loaded, ("parameters", name, "correlation"), section.correlation, list(values), "parameter", model)
         for other, value in section.correlation.items():
             mirrored = sections[other].correlation.get(name, value) if other in sections else value
             if name == other or mirrored != value:
@@ -215,7 +209,7 @@ def _assembled(model: StateSpaceModel, loaded: Loaded) -> StateSpaceModel:
     if estimated and isinstance(model.states, Field):
         name = next(iter(estimated))
         raise loaded.error(
-            uncertain[name], f"is uncertain, and {model.name} is a field, whose parameters are held; give no std"
+            own[name], f"is uncertain, and {model.name} is a field, whose parameters are held; give no std"
         )
     held = {name for name, section in sections.items() if section.role != "considered"}
     correlations = {
@@ -247,7 +241,7 @@ def _assembled(model: StateSpaceModel, loaded: Loaded) -> StateSpaceModel:
         keys = {
             "noise": ("noise", name, "correlation_time"),
             "error": ("sensors", name, "error"),
-            "estimate": uncertain.get(name, ()),
+            "estimate": own.get(name, ()),
             "correlation": ("parameters",),
             "instrument": ("sensors" if name in config.sensors else "inputs", name),
         }
@@ -307,6 +301,12 @@ def with_parameters(model: StateSpaceModel, loaded: Loaded) -> StateSpaceModel:
     config = loaded.config
     names = [item.name for item in model.parameters]
     names += [item for parts in _instruments(model, loaded).values() for item in parts]
+    times = [disturbance_time(name) for name, section in config.noise.items() if section.correlation_time is not None]
+    times += [error_time(name) for name, section in config.sensors.items() if section.error is not None]
+    for name in times:
+        if name in config.parameters and config.parameters[name].value is not None:
+            raise loaded.error(("parameters", name, "value"), "is a correlation time; give it as correlation_time")
+    names += times
     check_names(loaded, ("parameters",), config.parameters, names, "parameter", model)
     values = {name: section.value for name, section in config.parameters.items() if section.value is not None}
     for item in model.parameters:

@@ -64,13 +64,18 @@ def tuning_yaml(
     turned = {name: value for name, value in values.items() if name in config.parameters or value != known[name]}
     given = {name: section.model_dump(mode="json", exclude_unset=True) for name, section in config.parameters.items()}
     # A version replaces another, so it has the widths that are not the fit's too.
-    parameters: dict[str, Any] = {name: item for name, item in given.items() if whole or set(item) - {"value"}}
+    parameters: dict[str, Any] = {
+        name: item
+        for name, item in given.items()
+        if whole or (set(item) - {"value"} and config.parameters[name].role != "estimated")
+    }
     for name, value in (turned if whole else values).items():
         parameters[name] = {**parameters.get(name, {}), "value": value}
     if widths is not None:
         _add_widths(parameters, widths, with_spread(config, model, widths) if whole else [])
     parameters = {name: item["value"] if list(item) == ["value"] else item for name, item in parameters.items()}
-    lines += as_section("parameters", {name: item for name, item in parameters.items() if name not in times})
+    kept = {name: item for name, item in parameters.items() if name not in times or name in given}
+    lines += as_section("parameters", kept)
     if widths is not None or not whole:
         lines += as_section("valid_range", _fitted_ranges(config, model, widths))
     if prior is not None:

@@ -10,7 +10,7 @@ of crossing it arrives late, so each anchor has a bias with a correlation time,
 
     bias_i' = (reflection - bias_i) / bias_time + w,    so bias_i settles at reflection ± √(Q.bias · bias_time / 2)
 
-The positions of the anchors are parameters, set in the twin's YAML; they can be estimated as states (`estimate`).
+The positions of the anchors are parameters, set in the twin's YAML; they can be estimated (`role: estimated`).
 
 Sources: Thrun, Burgard & Fox (2005), Probabilistic Robotics, section 5.4, for the odometry; Djugash, Hamner & Roth
 (2009), doi:10.1002/rob.20311, for ranges whose errors grow with the distance.

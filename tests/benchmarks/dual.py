@@ -137,6 +137,8 @@ class Case(NamedTuple):
     note: str
 
 
+CURVE = "ocv_error: {std: 0.015, drift: 1e-4, role: estimated}"  # as in the twin
+
 CASES = (
     Case(
         "motor_bench, resistance of the water jacket, initially 50 % off",
@@ -148,8 +150,7 @@ CASES = (
         "motor_bench", "magnet", "tooth_magnet", 600.0, 300.0,
         {
             "tuning": "held",
-            "parameters.tooth_magnet": "1.65",
-            "estimate": "{tooth_magnet: {std: 0.5, drift: 1e-4}}",
+            "parameters.tooth_magnet": "{value: 1.65, std: 0.5, drift: 1e-4, role: estimated}",
             "view": "{}",
         },
         "fitted with the magnet measured: 1.1 K/W",
@@ -162,13 +163,16 @@ CASES = (
     Case(
         "battery_panasonic, US06, series resistance, initially 50 % off",
         "battery_panasonic", "soc", "r0", 1200.0, 600.0,
-        {"parameters": "{r0: 0.0492}", "estimate.r0": "{std: 0.02, drift: 3e-5}"},
+        {"parameters": f"{{r0: {{value: 0.0492, std: 0.02, drift: 3e-5, role: estimated}}, {CURVE}}}"},
         "fitted with the charge known: 0.0328 Ω",
     ),
     Case(
         "battery_panasonic, US06, capacity, initially 20 % off, series resistance in the state both ways",
         "battery_panasonic", "soc", "capacity", 1800.0, 900.0,
-        {"parameters": "{capacity: 2.32}", "estimate.capacity": "{std: 0.6, drift: 1e-4}"},
+        {
+            "parameters": "{capacity: {value: 2.32, std: 0.6, drift: 1e-4, role: estimated}, "
+            f"r0: {{std: 0.005, drift: 3e-5, role: estimated}}, {CURVE}}}"
+        },
         "by the tester's counter: 2.9 A h",
     ),
 )  # fmt: skip
@@ -176,11 +180,8 @@ CASES = (
 
 def twin_with_held(case: Case) -> Twin:
     """Return the twin with the parameter held; other parameters that it estimates stay states."""
-    names = load_twin(case.twin, overrides=case.more).config.estimate
-    kept = {name: section for name, section in names.items() if name != case.parameter}
-    flow = ", ".join(f"{name}: {{std: {section.std}, drift: {section.drift}}}" for name, section in kept.items())
-    more = {key: value for key, value in case.more.items() if not key.startswith("estimate")}
-    return load_twin(case.twin, overrides={**more, "estimate": f"{{{flow}}}", "view": "{}"})
+    held = {f"parameters.{case.parameter}.{key}": value for key, value in (("role", "held"), ("drift", "0"))}
+    return load_twin(case.twin, overrides={**case.more, **held, "view": "{}"})
 
 
 def row(name: str, error: np.ndarray, std: np.ndarray, spent: float, remark: str, **more: float) -> BenchmarkRow:

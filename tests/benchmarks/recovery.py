@@ -89,7 +89,7 @@ CASES = (
             "p.copper_resistance": 0.0115, "p.yoke_coolant": 0.036,
         },
         900.0,
-        {"estimate": "{}", "source.initial": "{}", "view.pairs": "[[winding, magnet]]"},
+        {"parameters": "{}", "source.initial": "{}", "view.pairs": "[[winding, magnet]]"},
     ),
     Case(
         "lorenz63",

@@ -7,7 +7,9 @@ import pytest
 from config import old_names
 from config.loader import load
 from config.old_names import new_key, rewrite, rewritten
+from estimators.errors import ConfigError
 from tests.cases import cases
+from tests.support import error_of
 
 OLD = """model: battery_cell           # a cell
 prior: {soc: {mean: 0.5, std: 0.1}}
@@ -96,6 +98,31 @@ def test_a_twin_of_the_version_before_is_that_of_this_one_and_one_line_names_wha
     (line,) = caplog.messages
     assert line.startswith(f"{tmp_path / 'cell.yaml'}: valid (line 3) is valid_range now, ")
     assert line.endswith(f"an interval is [low, high] now; `nisus migrate {tmp_path / 'cell.yaml'}` rewrites it")
+
+
+JOINT = """model: battery_cell
+estimate:
+  r0: {std: 0.005, drift: 1e-6}  # ohm
+  r1:
+    std: 0.01
+source: {type: push}
+"""
+
+
+def test_what_was_estimated_is_the_role_of_a_parameter(tmp_path):
+    new = JOINT.replace("estimate:", "parameters:").replace("1e-6}", "1e-6, role: estimated}")
+    new = new.replace("0.01\n", "0.01\n    role: estimated\n")
+    assert rewritten(JOINT) == new
+    alone = loaded(tmp_path, JOINT).config.parameters
+    assert alone == loaded(tmp_path, new).config.parameters and alone["r0"].role == alone["r1"].role == "estimated"
+    # Beside a section of parameters the text stays; the values are the same.
+    both = loaded(tmp_path, JOINT + "parameters: {r1: {value: 0.03, std: 0.5}, r0: 0.02}\n")
+    assert both.text.startswith(JOINT) and both.places.older[-1].endswith("now, move its entries there by hand")
+    given = {name: item.model_dump(exclude_unset=True) for name, item in both.config.parameters.items()}
+    assert given["r0"] == {"value": 0.02, "std": 0.005, "drift": 1e-6, "role": "estimated"}
+    assert given["r1"] == {"value": 0.03, "std": 0.01, "role": "estimated"}
+    wrong = error_of(ConfigError, loaded, tmp_path, JOINT.replace("0.01", "-1"))
+    assert wrong == f"{tmp_path / 'cell.yaml'}:5: parameters.r1.std is -1; it must be positive"
 
 
 @cases(__file__, "old_keys.csv")

@@ -105,7 +105,7 @@ def picture_of(twin: Any, log: Log) -> str:
         for kind, color, width in (("mean", LIGHT.estimate, 1.6), ("truth", LIGHT.truth, 1.1)):
             _draw_line(axes, np.stack([series.raw(f"{kind}:{name}") for name in (names[0], names[2])]), color, width)
     else:
-        sought = next(iter(twin.config.estimate), None)
+        sought = next((name for name, item in twin.config.parameters.items() if item.role == "estimated"), None)
         series = TrackSeries(model, events, track, MAX_CARD_GROUPS)
         _draw_states(axes, series, [sought or _least_measured(series)])
     return _themed_svg(figure)

@@ -121,7 +121,7 @@ def _estimated(loaded: Loaded, section: AssetSection, model: StateSpaceModel) ->
     if section.truth.model is not None:
         return []
     sections = parameter_sections(model, loaded.config)
-    joint = {*loaded.config.estimate, *(name for name, item in sections.items() if item.role == "estimated")}
+    joint = {name for name, item in sections.items() if item.role == "estimated"}
     return [name for name in section.truth.parameters if name in joint and name in model.state_names]
 
 

@@ -166,7 +166,7 @@ def test_recordings_follow_each_other_and_the_last_is_kept_with_its_evidence(nis
 def test_wear_of_a_simulated_asset_is_followed(nisus):
     """The water jacket of a motor silts up halfway: its true resistance grows by 40 %, unknown to the twin."""
     asset = {
-        "estimate": "{}", "source.initial": "{}", "source.truth": "{}", "view": "{}",
+        "parameters": "{}", "source.initial": "{}", "source.truth": "{}", "view": "{}",
         "source.faults": "[{kind: model, parameter: yoke_coolant, size: 1.4, start: 600}]",
     }  # fmt: skip
     given = [word for key, value in asset.items() for word in ("--set", f"{key}={value}")]

@@ -47,7 +47,7 @@ def test_states_parameters_and_noises_are_appended():
 
 def test_what_is_appended_may_be_named_wherever_a_state_or_a_parameter_may():
     text = LASTING + (
-        "prior: {winding_error: {mean: 1, std: 3}}\nestimate: {winding_error_time: {std: 50}}\n"
+        "prior: {winding_error: {mean: 1, std: 3}}\nparameters: {winding_error_time: {std: 50, role: estimated}}\n"
         "valid_range: {winding_error: [-9, 9]}\nview: {pairs: [[temperature, winding_error]]}\n"
     )
     twin = twin_of(text.replace("kf", "ekf"))

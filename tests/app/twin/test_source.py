@@ -232,7 +232,7 @@ source:
 
 JOINT = """\
 model: motor_drive
-estimate: {yoke_coolant: {std: 0.01, drift: 1e-3}}
+parameters: {yoke_coolant: {std: 0.01, drift: 1e-3, role: estimated}}
 source:
   type: simulator
   step: 0.5

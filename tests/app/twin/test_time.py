@@ -93,7 +93,7 @@ def paused(tmp_path, times, after, known=0):
     (tmp_path / "log.csv").write_text("\n".join(["t,i,v,c", *(f"{t},{'1' * (t >= known)},3.6,25.0" for t in times)]))
     path = tmp_path / "cell.yaml"
     path.write_text(
-        "model: battery_cell\nestimate: {r0: {std: 0.005}}\nprior: {soc: {mean: 0.45, std: 0.2}}\n"
+        "model: battery_cell\nparameters: {r0: {std: 0.005, role: estimated}}\nprior: {soc: {mean: 0.45, std: 0.2}}\n"
         f"time: {{paused_after: {after}}}\nsource:\n  {{type: table, files: log.csv, time: {{column: t}}, inputs: "
         "{current: {columns: i}}, sensors: {voltage: {columns: v}, temperature: {columns: c}}}\n"
     )

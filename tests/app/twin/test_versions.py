@@ -207,7 +207,9 @@ def test_how_long_errors_last_stands_beside_their_size():
     same(pasted(twin, "ekf", tuning).tuning, tuning)
     assert "disturbance_time" not in (text := tuning_yaml(twin.config, "ekf", tuning)) and "error_time" not in text
     # A correlation time that is estimated has no place in the tuning: the file's stays.
-    twin = load_twin("motor_can", overrides={**given, "estimate.winding_disturbance_time": "{std: 30}"})
+    twin = load_twin(
+        "motor_can", overrides={**given, "parameters.winding_disturbance_time": "{std: 30, role: estimated}"}
+    )
     assert "correlation_time: 120}" in tuning_yaml(twin.config, "ekf", twin.tuning)
 
 
