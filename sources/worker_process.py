@@ -1,6 +1,6 @@
 """Worker processes: run generator functions in a Python process of its own that ends with this one.
 
-A worker crashes, hangs or runs out of memory without harm to this process. The workshop's compilers and the readers of
+A worker crashes, hangs or runs out of memory without harm to this process. Compilers of filters and the readers of
 foreign files (`IsolatedReader`) use it. Nothing that takes long is imported here, so that a worker begins first.
 """
 

@@ -21,7 +21,7 @@ CHECKOUT = {
     "tests/test_nothing.py": "def test_one(): ...\ndef test_two(): ...",
     "tests/app/test_a.py": "",
     "tests/app/test_page_browser.py": "from app.a import x",
-    "tests/app/web/test_door.py": "",
+    "tests/app/web/test_http_server.py": "",
 }
 
 
@@ -39,7 +39,7 @@ def checkout(tmp_path):
     [
         ("app/a.py", {"tests/app/test_a.py": 0, "tests/test_b.py": 2, "tests/test_helped.py": 4}),
         ("app/c.py", {"tests/test_helped.py": 2}),
-        ("app/web/page/strip.js", {"tests/app/web/test_door.py": 1}),
+        ("app/web/page/strip.js", {"tests/app/web/test_http_server.py": 1}),
         ("tests/test_nothing.py", {"tests/test_nothing.py": 0}),
         ("app/gone.py", {}),
     ],

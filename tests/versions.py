@@ -27,7 +27,7 @@ FOLDERS = ("config", "sources")
 MODULES = (
     "test_imports.py", "test_readme.py", "test_affected.py", "estimators/numerics/test_jit.py",
     "estimators/numerics/test_simd_rows.py", "estimators/numerics/test_simd.py", "estimators/test_log.py",
-    "app/web/test_server.py", "app/web/test_door.py", "app/explore/test_feed.py",
+    "app/web/test_server.py", "app/web/test_http_server.py", "app/explore/test_feed.py",
     "app/scene/test_view.py", "app/scene/test_numbers.py", "app/cli/test_new.py",
     "app/cli/test_progress.py",
     "estimators/compiled/test_black_box.py::test_a_function_that_processes_cannot_import",

@@ -145,14 +145,14 @@ class FileOpener:
     def made_ready(self, opening: OpenedTwin) -> OpenedTwin:
         """See `Opener`."""
         workers, self._workers = self._workers, ()
-        workshop = begin_to_compile(opening.twin, workers)
+        compile_queue = begin_to_compile(opening.twin, workers)
         try:
             opening.twin.check_files()
-            compile_for(opening.twin, workshop)
+            compile_for(opening.twin, compile_queue)
         except BaseException:
-            workshop.stop()
+            compile_queue.stop()
             raise
-        return replace(opening, workshop=workshop)
+        return replace(opening, compile_queue=compile_queue)
 
     def prepare(self, twin: Twin) -> None:
         """See `Opener`."""

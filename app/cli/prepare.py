@@ -16,10 +16,10 @@ from estimators.model.state_space import StateSpaceModel
 from estimators.registry import ESTIMATORS, unfit
 from sources.pieces import make, pieces_of
 
+from ..engine.compile_queue import CompileQueue
 from ..engine.compilers import Compiler
 from ..engine.jobs import LoopThread, start_in_thread
 from ..engine.watchdog import CallWatch, interruptible
-from ..engine.workshop import Workshop
 from ..terminal import complain, messages_file
 from ..twin.twin import Twin, load_twin
 from .options import overrides_of
@@ -81,39 +81,39 @@ def prepare(twin: Twin) -> None:
     compile_for(twin)
 
 
-def compile_for(twin: Twin, workshop: Workshop | None = None) -> None:
+def compile_for(twin: Twin, compile_queue: CompileQueue | None = None) -> None:
     """Compile the twin's model and estimator, and what its source needs, or load them from the cache.
 
-    A workshop compiles everything but the model in other processes; the estimator may be ready only later.
+    A queue compiles everything but the model in other processes; the estimator may be ready only later.
 
     Raises:
         NisusError: If the model does not compile, or the estimator does not apply.
     """
 
     def work() -> None:
-        twin.fold(pairs=twin.pairs, idle=workshop is not None)
+        twin.fold(pairs=twin.pairs, idle=compile_queue is not None)
         for name in twin.kernels:
-            if workshop is not None:
-                workshop.wait(name)
+            if compile_queue is not None:
+                compile_queue.wait(name)
             else:
                 for piece in pieces_of(name):
                     make(piece)
 
-    what = "filters" if workshop is None else "the model"
+    what = "filters" if compile_queue is None else "the model"
     attend(twin.model, work, f"compiling {what}, once", f"compiled {what}, once")
 
 
-def begin_to_compile(twin: Twin, workers: Sequence[Compiler] = ()) -> Workshop:
+def begin_to_compile(twin: Twin, workers: Sequence[Compiler] = ()) -> CompileQueue:
     """Let other processes compile missing cache entries: those of the source, the twin's filter, then all others.
 
     Those that do not apply to the twin are left out. `workers` are processes that were started before.
     """
     filters = [name for name, entry in ESTIMATORS.items() if unfit(entry, twin.model) is None]
-    workshop = Workshop([*twin.kernels, *filters], workers=workers)
+    compile_queue = CompileQueue([*twin.kernels, *filters], workers=workers)
     for name in (*twin.kernels, twin.estimator):
-        workshop.ask(name)
-    workshop.start()
-    return workshop
+        compile_queue.ask(name)
+    compile_queue.start()
+    return compile_queue
 
 
 def attend(

@@ -14,9 +14,9 @@ from ..engine.execute import MAX_SPEED
 from ..record.rrd_file import TAKEN, check_date, parse_split
 from ..result import to_json
 from ..terminal import complain
-from ..web.door import check_port
+from ..web.access import grants_of
 from ..web.gallery.gallery import StartRequest
-from ..web.gate import grants_of
+from ..web.http_server import check_port
 from ..web.session import Page, Session
 from .open_twin import FileOpener, open_session, opened_review, opened_twin
 from .options import overrides_of

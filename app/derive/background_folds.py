@@ -21,11 +21,11 @@ from estimators.log import Log
 from estimators.pieces import SMOOTHER
 from estimators.smoothing.smooth import check_smooth, smooth
 
+from ..engine.compile_queue import CompileQueue
 from ..engine.copies import MAX_PULL_ROWS, Cursor, Pull
 from ..engine.jobs import Job
 from ..engine.revisions import Revision
 from ..engine.running_fold import Running
-from ..engine.workshop import Workshop
 
 POLL_PERIOD_S = 0.1
 """Between two looks for new events."""
@@ -207,10 +207,10 @@ class Smoother:
 
 def _compile(job: Job) -> None:
     """Compile the smoother in another process if it is not in the cache: here it would slow the engine."""
-    workshop = Workshop([SMOOTHER])
-    workshop.start()
+    compile_queue = CompileQueue([SMOOTHER])
+    compile_queue.start()
     try:
-        while not workshop.ready(SMOOTHER):
+        while not compile_queue.ready(SMOOTHER):
             job.rest(PERIOD_S)
     finally:
-        workshop.stop()
+        compile_queue.stop()

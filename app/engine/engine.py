@@ -33,16 +33,16 @@ from ..twin.changes import merged
 from ..twin.ingest import Ingest
 from . import commands
 from .batches import BatchSizer
+from .compile_queue import CompileQueue
 from .copies import LogTail, Status
 from .execute import execute
 from .feeder import Feeder, SourceBatch
 from .jobs import Job, Jobs, LoopThread, run_all
 from .outcomes import Outcomes
-from .running_fold import Keeper, Records, Running, StoredTwin
+from .running_fold import Records, Running, StateWriter, StoredTwin
 from .status import busy_status, past_status, status_of
 from .watchdog import Watchdog
 from .watchers import IdleTicks, Watchers
-from .workshop import Workshop
 
 if TYPE_CHECKING:
     from estimators.diagnostics.episodes import Episode, TrackedEpisode
@@ -83,7 +83,7 @@ class Engine(Running):
         *,
         base: Base | None = None,
         horizon: float | None = None,
-        workshop: Workshop | None = None,
+        compile_queue: CompileQueue | None = None,
         stored: StoredTwin | None = None,
     ) -> None:
         """Open the source and prepare the fold.
@@ -94,8 +94,8 @@ class Engine(Running):
             base: Start of the fold, if not the prior (that of a recording).
             horizon: Seconds of lateness allowed, in place of the twin's; infinity takes every reading (those of a
                 recording were judged when it was made).
-            workshop: Compiles filters, also the first, without which the log then begins. None: each is compiled where
-                it is needed.
+            compile_queue: Compiles filters, also the first, without which the log then begins. None: each is compiled
+                where it is needed.
             stored: State of the twin to continue, in place of `base`.
 
         Raises:
@@ -104,8 +104,8 @@ class Engine(Running):
         self._inbox: queue.SimpleQueue[SourceBatch | Callable[[], Any]] = queue.SimpleQueue()
         self._submitted: deque[Callable[[], Any]] = deque()
         """Commands and reloads that wait in the inbox; a fold is left unfinished for them."""
-        self._workshop = workshop or Workshop()
-        super().__init__(twin, Watchdog(self._report_stalled), base, self._workshop.ready, stored)
+        self._compile_queue = compile_queue or CompileQueue()
+        super().__init__(twin, Watchdog(self._report_stalled), base, self._compile_queue.ready, stored)
         self._awaited = self.estimator if self._fold.idle else None
         self._gesture = ""
         """Gesture of the edit that asked for the present settings."""
@@ -115,7 +115,7 @@ class Engine(Running):
         self._first_base = base
         self._tick = section.predict_every
         self._last_options: dict[str, Mapping[str, float]] = {}
-        self._workshop.report = lambda text: self.notices.say(text, level="warn")
+        self._compile_queue.report = lambda text: self.notices.say(text, level="warn")
         if self.twin.forced_baseline:
             self.notices.say(f"the baseline was accepted with --force: {self.twin.forced_baseline}", level="warn")
         self.outcomes = Outcomes()
@@ -146,7 +146,7 @@ class Engine(Running):
         self._watchers = Watchers(self)
         self.revisions.said = self._watchers.episodes_of
         self.recorder: Records | None = None
-        self.store: Keeper | None = None
+        self.store: StateWriter | None = None
         self._telling = threading.Lock()
         self._status = (-np.inf, self._status_now())
         self._thread = threading.Thread(target=self._run, name="engine", daemon=True)
@@ -197,7 +197,7 @@ class Engine(Running):
     def stop(self) -> None:
         """Stop reading and folding."""
         self._stopping.set()
-        run_all(self._join, self._feeder.stop, self._workshop.stop, *(pool.stop for pool in self._pools))
+        run_all(self._join, self._feeder.stop, self._compile_queue.stop, *(pool.stop for pool in self._pools))
         self._watchers.episode_log.stop()
         self._watching.stopping.set()
 
@@ -326,7 +326,7 @@ class Engine(Running):
             "finished": self._finished,
             "recording": self.recorder.path if self.recorder is not None else None,
             "awaited": self._awaited,
-            "compiling": self._workshop.states(),
+            "compiling": self._compile_queue.states(),
             "paused": paced is not None and paced.paused,
             "speed": paced.speed if paced is not None else None,
             "seekable": paced is not None,
@@ -523,10 +523,10 @@ class Engine(Running):
         ticket = self._requests.ask()
         with self._lock:
             self.estimator, self.tuning, self._gesture = estimator, tuning, gesture
-        self._awaited = None if self._workshop.ready(estimator) else estimator
+        self._awaited = None if self._compile_queue.ready(estimator) else estimator
         self._status = (-np.inf, self._status[1])
         if self._awaited is not None:
-            self._workshop.ask(estimator, lambda name: self._inbox.put(partial(self._compiled, name)))
+            self._compile_queue.ask(estimator, lambda name: self._inbox.put(partial(self._compiled, name)))
             return
         log, base = self._log.copy(), self._base
         self._ask_refold(ticket, lambda: self._make_fold(estimator, tuning, log, base), gesture)

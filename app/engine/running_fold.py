@@ -67,7 +67,7 @@ class Published(Protocol):
         """Return the state of outputs, receivers and alerts."""
 
 
-class Keeper(Protocol):
+class StateWriter(Protocol):
     """Writer of the store of a running twin."""
 
     def ask(self) -> None:

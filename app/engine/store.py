@@ -474,11 +474,11 @@ class StoreWriter:
         self._jobs.start()
 
     def ask(self) -> None:
-        """See `Keeper`."""
+        """See `StateWriter`."""
         self._asked.set()
 
     def has(self, mark: int) -> bool | None:
-        """See `Keeper`."""
+        """See `StateWriter`."""
         return None if self._failed else self._mark >= mark
 
     def _when_due(self, job: Job) -> None:

@@ -17,8 +17,8 @@ from ..engine.history_copy import follow
 from ..engine.jobs import LoopThread
 from ..engine.running_fold import Running
 from .guarded_server import addresses, guarded_server, unprinted, when_connected
+from .renderer import FIELD_SCENES, SceneRenderer
 from .scene import History
-from .stage import FIELD_SCENES, Stage
 
 FRAME_PERIOD_S = 0.1  # Seconds between two cheap frames
 MAX_CPU_SHARE = 0.08  # Share of a core that drawing may take: expensive frames are drawn less often
@@ -43,7 +43,7 @@ class ViserView:
         self.engine = engine
         self.server = guarded_server(secret, engine.twin.title)
         self.port: int = self.server.get_port()
-        self.stage = Stage(self.server, engine)
+        self.renderer = SceneRenderer(self.server, engine)
         model, large = engine.model, engine.model.grid is not None
         limit = 4096 if large else 32_768
         self.history = History(len(model.shown), model.width, limit)
@@ -74,14 +74,14 @@ class ViserView:
     def frame(self) -> None:
         """Update the scene to the engine's present state."""
         with self.server.atomic():
-            at = self.stage.choices.at
-            if self.stage.prepare() or (self._cursor is None) != (at is not None):
+            at = self.renderer.choices.at
+            if self.renderer.prepare() or (self._cursor is None) != (at is not None):
                 self._rest()
             if at is None and self._cursor is None:
                 self._cursor = self.engine.cursor(span=self.history.span)
-            changed = (self._pull() if at is None else self._look_back(at)) or self.stage.due
+            changed = (self._pull() if at is None else self._look_back(at)) or self.renderer.due
             if changed:
-                self.stage.draw(self.history, at)
+                self.renderer.draw(self.history, at)
 
     def _rest(self) -> None:
         """Forget all rows, and the cursor."""
@@ -112,8 +112,8 @@ class ViserView:
         return changed
 
     def _take(self, pull: Any) -> None:
-        if isinstance(self.stage.scene, FIELD_SCENES):
-            self.stage.scene.take(pull)
+        if isinstance(self.renderer.scene, FIELD_SCENES):
+            self.renderer.scene.take(pull)
         self.history.take(replace(pull, track=shown_track(self.engine.model, pull.track)))
         self.history.trim()
 
@@ -127,7 +127,7 @@ class ViserView:
     def _look(self, there: Sequence[str]) -> None:
         """Draw for the connected browsers, whose addresses have these queries."""
         # Two browsers may differ; the scene has the colours of the last one's theme.
-        self.stage.palette = THEMES.get(parse_qs(there[-1]).get("theme", ["light"])[0], THEMES["light"])
+        self.renderer.palette = THEMES.get(parse_qs(there[-1]).get("theme", ["light"])[0], THEMES["light"])
         self.frame()
 
     def _run(self) -> None:

@@ -19,7 +19,7 @@ from estimators.errors import ConfigError, shown_name
 from sources.messages import ACCEPTED, CLOSED, DUPLICATE, NO_ROOM, REFUSED, Answer, Messages
 
 from ..engine.outcomes import Outcomes
-from ..engine.running_fold import Keeper
+from ..engine.running_fold import StateWriter
 from ..twin.twin import Twin
 from .http import Json, TooLarge, bounded_body, get, refusal
 from .request_threads import in_thread
@@ -45,7 +45,7 @@ class Recipient(Protocol):
         """Its source."""
 
     @property
-    def store(self) -> Keeper | None:
+    def store(self) -> StateWriter | None:
         """Where it keeps its state."""
 
     @property

@@ -23,11 +23,11 @@ if TYPE_CHECKING:
     from estimators.snapshots import Base
     from sources.source import Source
 
+    from ..engine.compile_queue import CompileQueue
     from ..engine.notices import Annotation
-    from ..engine.workshop import Workshop
     from ..explore.rows import RerunRows
     from ..twin.twin import Twin
-    from .door import Door
+    from .http_server import HttpServer
 
 
 PRINT_PERIOD_S = 0.5
@@ -55,7 +55,7 @@ class OpenedTwin:
 
     `open_source`, `base` and `horizon` are those of `Engine`; `review` is the reviewed recording, `said` the notices of
     its session, `annotations` its notes of users, `remarks` new notices, (level, text). `files` are the twin's files,
-    `stamp` their state when read, and `again` reads them once more; a recording has none. `workshop` compiles its
+    `stamp` their state when read, and `again` reads them once more; a recording has none. `compile_queue` compiles its
     filters, and stops with the engine. `store` is the file from which it continues after a restart,
     `archive` makes the archive of its rows.
     """
@@ -71,7 +71,7 @@ class OpenedTwin:
     files: tuple[Path, ...] = ()
     stamp: Stamp = ()
     again: Callable[[], Twin] | None = None
-    workshop: Workshop | None = None
+    compile_queue: CompileQueue | None = None
     store: Path | None = None
     archive: Callable[..., Any] | None = None
 
@@ -83,7 +83,7 @@ class RunningTwin:
         self,
         opening: OpenedTwin,
         *,
-        door: Door | None,
+        http_server: HttpServer | None,
         split: Split = NEVER,
         recordings: Path | None = None,
         printed: bool = False,
@@ -92,7 +92,7 @@ class RunningTwin:
 
         Args:
             opening: What to run.
-            door: Behind which the page shows it, once it is started; None for no page.
+            http_server: Shows its page, once it is started; None for no page.
             split: Into what parts to split a recording.
             recordings: Folder of recordings made on the page; None is the working directory.
             printed: Whether all notices are printed on standard error, not errors alone.
@@ -113,7 +113,7 @@ class RunningTwin:
                 opening.open_source,
                 base=opening.base,
                 horizon=opening.horizon,
-                workshop=opening.workshop,
+                compile_queue=opening.compile_queue,
                 stored=stored,
             )
         except BaseException:
@@ -140,13 +140,13 @@ class RunningTwin:
             if config.outputs.receivers:
                 self.engine.notices.say("a recording is replayed: no alerts are sent")
         else:
-            page = None if door is None else door.site
+            page = None if http_server is None else http_server.site
             self.publisher = self.engine.published = Publisher(self.engine, page=page, store=store)
         self.view: Any = None
         self.server: Any = None
         self.gone: threading.Event | None = None
         """After the start: set once the application shown before has no connection left."""
-        if door is not None:
+        if http_server is not None:
             from ..scene.view import ViserView
             from .server import PageServer
 
@@ -155,11 +155,11 @@ class RunningTwin:
                 self.view = ViserView(self.engine, secret=secret)
                 self.server = PageServer(
                     self.engine,
-                    port=door,
+                    port=http_server,
                     viser_port=self.view.port,
                     secret=secret,
                     review=opening.review,
-                    choices=self.view.stage.choices,
+                    choices=self.view.renderer.choices,
                     refits=self.refits,
                 )
             except BaseException:

@@ -40,9 +40,9 @@ from ..study.why import why_json
 from ..terminal import messages_file
 from . import readings
 from .commands_json import command_from_json, commands_schema
-from .door import Door
 from .fit_api import FitApi
 from .http import PAGE, OneAtATime, get, one_line, openapi, page_file, post, refusal
+from .http_server import HttpServer
 from .request_threads import in_rerun_thread, in_thread
 from .runs_api import RunsApi
 from .streams import PageStream, feed_rerun
@@ -53,7 +53,7 @@ from .viser_proxy import ViserProxy
 if TYPE_CHECKING:
     from ..charts.colors import Palette
     from ..explore.feed import RerunFeed
-    from ..scene.stage import Choices
+    from ..scene.renderer import Choices
 
 COMPILE_POLL_PERIOD_S = 0.5
 """Between two looks at whether the first filter is compiled."""
@@ -75,13 +75,13 @@ def _message(found: StateMessage) -> Response:
 
 
 class PageServer:
-    """Serves one engine to any number of browsers, behind a door that may outlive it."""
+    """Serves one engine to any number of browsers, on an HTTP server that may outlive it."""
 
     def __init__(
         self,
         engine: Engine,
         *,
-        port: int | Door,
+        port: int | HttpServer,
         viser_port: int | None,
         secret: str,
         review: Path | None = None,
@@ -92,7 +92,7 @@ class PageServer:
 
         Args:
             engine: The running twin.
-            port: On 127.0.0.1; 0 takes a free one. Or an open door, which shows this once it is started.
+            port: On 127.0.0.1; 0 takes a free one. Or an open server, which shows this once it is started.
             viser_port: Port of the private Viser server; None if there is none.
             secret: Secret of the Viser server.
             review: The reviewed recording, offered beside those that this process writes.
@@ -111,9 +111,9 @@ class PageServer:
         self._boot = uuid.uuid4().hex
         self.unread: str | None = None
         """Why the twin's files, as saved last, could not be read; None if they run."""
-        self._own_door = not isinstance(port, Door)
-        self.door = port if isinstance(port, Door) else Door(port)
-        self.port, self.entered = self.door.port, self.door.entered
+        self._own_server = not isinstance(port, HttpServer)
+        self.http_server = port if isinstance(port, HttpServer) else HttpServer(port)
+        self.port, self.entered = self.http_server.port, self.http_server.entered
         self._assets: Future[Path] = Future()
         self._explored, self._stopping = threading.Event(), threading.Event()
         self._viser = ViserProxy(viser_port, secret) if viser_port is not None else None
@@ -122,21 +122,21 @@ class PageServer:
     @property
     def url(self) -> str:
         """Address of the page, with its token."""
-        return self.door.url
+        return self.http_server.url
 
     def start(self) -> threading.Event:
         """Serve; return an event that is set once the application before has no connection left."""
         threading.Thread(target=self._prepare_viewer, name="viewer assets", daemon=True).start()
-        disconnected = self.door.show(self.application, self._boot, self._engine.audit)
-        if self._own_door:
-            self.door.start()
+        disconnected = self.http_server.show(self.application, self._boot, self._engine.audit)
+        if self._own_server:
+            self.http_server.start()
         return disconnected
 
     def stop(self) -> None:
         """Stop all work, close all connections, and the port if it is this twin's own."""
         self._stopping.set()
-        if self._own_door:
-            self.door.stop()
+        if self._own_server:
+            self.http_server.stop()
 
     def _prepare_viewer(self) -> None:
         """Unpack the Rerun viewer's files, after the first filter is compiled or once a browser opens Explore."""
@@ -203,9 +203,9 @@ class PageServer:
 
     def _page(self, name: str) -> Response:
         settings = {"viewer": f"viewer/{viewer_version()}", "boot": self._boot, "viser": self._viser is not None}
-        settings |= {"charts": CHART_FILES, "gallery": self.door.has_gallery, "stage_pass": self.door.stage_pass}
-        settings |= {"overview": self.door.overview}
-        return page_file(name, settings | {"panels": list(registered("panels"))})
+        server = self.http_server
+        settings |= {"charts": CHART_FILES, "gallery": server.has_gallery, "stage_pass": server.scene_pass}
+        return page_file(name, settings | {"overview": server.overview, "panels": list(registered("panels"))})
 
     def _panel(self, title: str) -> Response:
         """Answer with the script of a tab that an extension adds."""
@@ -340,7 +340,7 @@ class PageServer:
 
     def _openapi(self) -> dict[str, Any]:
         """Return the OpenAPI document of all paths."""
-        return openapi([*self.door.routes, *self.application.routes])
+        return openapi([*self.http_server.routes, *self.application.routes])
 
     def _alerts(self) -> dict[str, Any]:
         """Return open alerts, and the state of outputs and receivers."""

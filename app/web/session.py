@@ -24,8 +24,8 @@ from ..engine.commands import Record
 from ..engine.jobs import run_all
 from ..record.rrd_file import NEVER, Split
 from ..terminal import complain, until_asked_to_end
-from .door import Door
-from .gate import Grant
+from .access import Grant
+from .http_server import HttpServer
 from .running import OpenedTwin, RunningTwin
 
 if TYPE_CHECKING:
@@ -134,7 +134,7 @@ class Session:
             for option, value in MALLOC_OPTIONS:
                 ctypes.CDLL(None).mallopt(option, value)
         self._page, self._split, self._recordings, self._printed = page, split, recordings, printed
-        self.door: Door | None = None
+        self.http_server: HttpServer | None = None
         self.running: RunningTwin | None = None
         self._changing = threading.RLock()
         self._recorded: list[Path] = []
@@ -143,13 +143,14 @@ class Session:
         self.starts: Callable[[RunningTwin], object] = lambda running: None
         """Called with each twin that is about to start."""
         if page is not None:
-            self.door = Door(page.port, page.grants, public=page.public, overview=page.overview, site=page.site)
+            public, overview, site = page.public, page.overview, page.site
+            self.http_server = HttpServer(page.port, page.grants, public=public, overview=overview, site=site)
         try:
             if opening is not None:
                 self.running = self.prepared(opening)
         except BaseException:
-            if self.door is not None:
-                self.door.stop()
+            if self.http_server is not None:
+                self.http_server.stop()
             raise
 
     @property
@@ -170,7 +171,7 @@ class Session:
     @property
     def url(self) -> str | None:
         """Address of the page, with its token."""
-        return self.door.url if self.door is not None else None
+        return self.http_server.url if self.http_server is not None else None
 
     @property
     def recorded(self) -> list[Path]:
@@ -188,7 +189,7 @@ class Session:
         if not opening.annotations:
             opening = replace(opening, annotations=self._notes.get(_log_of(opening), ()))
         split, folder, printed = self._split, self._recordings, self._printed
-        return RunningTwin(opening, door=self.door, split=split, recordings=folder, printed=printed)
+        return RunningTwin(opening, http_server=self.http_server, split=split, recordings=folder, printed=printed)
 
     def _keep_notes(self) -> None:
         """Keep the notes of the running twin for its next start in this session."""
@@ -227,13 +228,13 @@ class Session:
                     self.starts(after)
                     after.start()
                     _settle(after.gone, left)
-                elif stopped and self.door is not None:
-                    self.door.show(None)
+                elif stopped and self.http_server is not None:
+                    self.http_server.show(None)
 
     def start(self) -> None:
         """Start everything."""
-        if self.door is not None:
-            self.door.start()
+        if self.http_server is not None:
+            self.http_server.start()
         if self.running is not None:
             self.starts(self.running)
             self.running.start()
@@ -242,7 +243,7 @@ class Session:
     def stop(self) -> None:
         """Stop everything; a recording is finished."""
         with self._changing:
-            ends = [item.stop for item in (self.running, self.door) if item is not None]
+            ends = [item.stop for item in (self.running, self.http_server) if item is not None]
             run_all(*ends)
 
     def _open(self, url: str) -> BrowserPage | None:
@@ -287,7 +288,7 @@ class Session:
                 if time.monotonic() >= trim_at:
                     _trim()
                     trim_at = time.monotonic() + TRIM_PERIOD_S
-                if opening is not None and self.door is not None and self.door.entered.is_set():
+                if opening is not None and self.http_server is not None and self.http_server.entered.is_set():
                     opening.close()
                     opening = None
         if record is not None and self.recorder.failure:

@@ -28,7 +28,7 @@ from .twin_json import annotations_json, episodes_json, moment_json
 if TYPE_CHECKING:
     from ..engine.notices import Annotation
     from ..explore.feed import RerunFeed
-    from ..scene.stage import Choices
+    from ..scene.renderer import Choices
 
 FRAME_PERIOD_S = 0.1
 STATUS_PERIOD_S = 0.25

@@ -51,7 +51,7 @@ class ViserProxy:
 
     async def websocket(self, browser: WebSocket) -> None:
         """Couple a browser's WebSocket with one of Viser's, until either closes."""
-        # The pass is for the gate alone.
+        # The pass is for the access control alone.
         query = urlencode([(name, value) for name, value in browser.query_params.multi_items() if name != "pass"])
         path = quote(browser.path_params.get("path", ""))
         url = f"ws://127.0.0.1:{self._port}/{path}" + (f"?{query}" if query else "")

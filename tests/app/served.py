@@ -14,7 +14,7 @@ from websockets.sync.server import serve
 
 from app.engine.engine import Engine
 from app.scene.guarded_server import HEADER
-from app.scene.stage import Choice, Choices
+from app.scene.renderer import Choice, Choices
 from app.twin.versions import VERDICT_FILE
 from app.web.server import PageServer
 from config.tunings import folders

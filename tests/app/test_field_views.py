@@ -278,7 +278,7 @@ def test_the_scene_shows_the_picture_that_is_chosen_and_the_sensor_that_is_off(r
     view = ViserView(live.engine, secret="s")
     try:
         view.frame()
-        scene, pull = view.stage.scene, live.pull()
+        scene, pull = view.renderer.scene, live.pull()
         assert scene._title.text == "temperature: estimate [°C]"
         frame = PictureFrame.of(live.engine.model.grid)
         first = scene._image.image.copy()
@@ -302,7 +302,7 @@ def test_the_scene_shows_the_picture_that_is_chosen_and_the_sensor_that_is_off(r
         monkeypatch.undo()
         monkeypatch.setattr(field_scene.time, "monotonic", lambda: clock.now)
         clock.now += field_scene.PICTURE_PERIOD_S
-        view.stage.choices.choose("picture", ERROR.title)
+        view.renderer.choices.choose("picture", ERROR.title)
         view.frame()
         assert scene._title.text == "temperature: estimate − truth [°C]"
         assert not np.array_equal(scene._image.image, first)

@@ -73,7 +73,7 @@ def test_what_fails_is_raised_once_all_are_done():
 
 def test_the_recording_is_closed_after_the_last_row_and_has_it(tmp_path, monkeypatch):
     twin, path = load_twin("motor_winding"), tmp_path / "run.rrd"
-    running = RunningTwin(OpenedTwin(twin, live_source(twin, 100.0)), door=None, recordings=tmp_path)
+    running = RunningTwin(OpenedTwin(twin, live_source(twin, 100.0)), http_server=None, recordings=tmp_path)
     order = []
 
     def end(part, *, short=False):

@@ -96,7 +96,7 @@ class PipeSource:
 def run_fed(path: Path) -> None:
     """Run the twin until this process is killed."""
     twin = fed_twin()
-    running = RunningTwin(OpenedTwin(twin, lambda report: PipeSource(twin.model.width), store=path), door=None)
+    running = RunningTwin(OpenedTwin(twin, lambda report: PipeSource(twin.model.width), store=path), http_server=None)
     running.start()
     print("ready", flush=True)
     threading.Event().wait()

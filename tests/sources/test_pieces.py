@@ -1,4 +1,4 @@
-"""What the workshop compiles for a source is what the source runs: nothing is compiled when the first event waits."""
+"""What the queue compiles for a source is what the source runs: nothing is compiled when the first event waits."""
 
 import pytest
 

@@ -15,7 +15,7 @@ from typing import TYPE_CHECKING, Any
 from app.cli.options import overrides_of
 from app.cli.prepare import attend, compile_for
 from app.extensions.archive.parts import ArchivePlan
-from app.extensions.service.command import PRELOADED, door_of, run_child, serve_until_end
+from app.extensions.service.command import PRELOADED, run_child, serve_until_end, server_of
 from app.extensions.service.service import Service
 from app.extensions.service.supervisor import Supervisor
 from app.record.rrd_file import parse_split
@@ -36,7 +36,7 @@ from .running import STOPPED, STORE, RunningFleet
 from .table import arrow_table, counts_of, fleet_topics, in_name_order, ordered
 
 if TYPE_CHECKING:
-    from app.web.door import Door
+    from app.web.http_server import HttpServer
     from app.web.running import OpenedTwin
     from app.web.session import Session
 
@@ -62,7 +62,7 @@ def run_fleet(arguments: FleetCommand) -> int:
         raise ConfigError("--json: is the result of a run without a page; give --headless")
     overrides = overrides_of(arguments)
     plan = load_fleet(arguments.fleet, overrides)
-    door = None if arguments.headless else door_of(arguments)
+    http_server = None if arguments.headless else server_of(arguments)
     plan.check_files()
     compile_for(plan.twin)
     store = arguments.store
@@ -83,13 +83,13 @@ def run_fleet(arguments: FleetCommand) -> int:
             running.note(key, text)
 
         running.archive = FleetArchive(archive, plan.twin.model, running.names, say, running.archived)
-    page = None if door is None else door.site
+    page = None if http_server is None else http_server.site
     if not plan.ends:
         publisher = FleetPublisher(running, page=page)
         running.end_publishing = publisher.stop
         publisher.start()
-    if door is not None:
-        _serve(running, door, arguments, overrides, archive)
+    if http_server is not None:
+        _serve(running, http_server, arguments, overrides, archive)
     else:
         _fold(running, arguments.duration)
     _, _, table = running.table()
@@ -97,13 +97,13 @@ def run_fleet(arguments: FleetCommand) -> int:
         place = plan.source.loaded.places.at(("source",))
         if plan.ends:
             raise ConfigError(f"{place}: the source has no values for any sensor; check the channel maps")
-        if door is None or out is not None:
+        if http_server is None or out is not None:
             raise SourceError(f"{place}: no measurement arrived; check that its senders run")
         return 0
     table = in_name_order(table)
     if out is not None:
         _write(out, plan, table)
-    if door is not None:
+    if http_server is not None:
         return 0
     topics = fleet_topics(plan.twin.model, table, arguments.worst)
     print(_json(plan, table) if arguments.json else to_text(topics))
@@ -119,7 +119,7 @@ def _fold(running: RunningFleet, duration: float | None) -> None:
 
 def _serve(
     running: RunningFleet,
-    door: Door,
+    http_server: HttpServer,
     arguments: FleetCommand,
     overrides: Mapping[str, str],
     archive: ArchivePlan | None,
@@ -130,7 +130,7 @@ def _serve(
     overview = FleetApi(running)
     supervisor = Supervisor({}, partial(run_child, opened, False), preload=FLEET_PRELOADED, on_demand=True)
     try:
-        service = Service(supervisor, door=door, overview=overview)
+        service = Service(supervisor, http_server=http_server, overview=overview)
         running.start()
         serve_until_end(service, f"the fleet {running.plan.name}", arguments.duration)
     finally:

@@ -181,15 +181,15 @@ class RunningFleet:
 
     @property
     def store(self) -> RunningFleet | None:
-        """What keeps its state, see `Keeper`; None without a store."""
+        """What keeps its state, see `StateWriter`; None without a store."""
         return None if self.file is None else self
 
     def ask(self) -> None:
-        """See `Keeper`."""
+        """See `StateWriter`."""
         self._asked = True
 
     def has(self, mark: int) -> bool | None:
-        """See `Keeper`."""
+        """See `StateWriter`."""
         return None if self.failure or self._unwritten else self._kept >= mark
 
     @property

@@ -19,8 +19,8 @@ from urllib.parse import quote
 
 from app.record.rrd_file import NEVER, Split, parse_split
 from app.terminal import until_asked_to_end, use_lines_of_json, when_asked_to_end
-from app.web.door import LOOPBACK, Door, check_port
-from app.web.gate import NEEDS_TOKENS, Grant, grants_of
+from app.web.access import NEEDS_TOKENS, Grant, grants_of
+from app.web.http_server import LOOPBACK, HttpServer, check_port
 from config.loader import shipped
 from estimators.errors import ConfigError, NisusError, is_blank, quoted
 
@@ -64,14 +64,14 @@ def serve(arguments: ServeCommand) -> int:
     for place in (options.store, options.recordings, options.archive):
         if place is not None and place.exists() and not place.is_dir():
             raise ConfigError(f"{place}: must be a folder, in which each twin has its own file")
-    door = door_of(arguments, grants)
-    options = options._replace(site=door.site)
+    http_server = server_of(arguments, grants)
+    options = options._replace(site=http_server.site)
     supervisor = Supervisor(
         twins, partial(run_child, partial(_opened, options), options.json), preload=PRELOADED,
         at_once=max(1, (os.cpu_count() or 2) // 2),
         folder=folder,
     )  # fmt: skip
-    return serve_until_end(Service(supervisor, door=door), f"{len(twins)} twin(s)", arguments.duration)
+    return serve_until_end(Service(supervisor, http_server=http_server), f"{len(twins)} twin(s)", arguments.duration)
 
 
 def _grants(arguments: ServiceOptions) -> tuple[Grant, ...]:
@@ -81,8 +81,8 @@ def _grants(arguments: ServiceOptions) -> tuple[Grant, ...]:
     return grants_of(arguments.tokens, arguments.public)
 
 
-def door_of(arguments: ServiceOptions, grants: tuple[Grant, ...] | None = None) -> Door:
-    """Return the door of a service.
+def server_of(arguments: ServiceOptions, grants: tuple[Grant, ...] | None = None) -> HttpServer:
+    """Return the HTTP server of a service.
 
     Raises:
         ConfigError: If the port is not free, or others can reach it without tokens.
@@ -92,7 +92,7 @@ def door_of(arguments: ServiceOptions, grants: tuple[Grant, ...] | None = None) 
     if loopback:
         check_port(arguments.port)
     host = LOOPBACK if loopback else arguments.host
-    return Door(arguments.port, grants, host=host, public=arguments.public)
+    return HttpServer(arguments.port, grants, host=host, public=arguments.public)
 
 
 def serve_until_end(service: Service, what: str, duration: float | None) -> int:
@@ -100,7 +100,7 @@ def serve_until_end(service: Service, what: str, duration: float | None) -> int:
     end = time.monotonic() + (duration or float("inf"))
     with until_asked_to_end(service.stop) as done:
         service.start()
-        print(f"Nisus serves {what} at\n\n    {service.door.url}\n\nCtrl-C ends it.", flush=True)
+        print(f"Nisus serves {what} at\n\n    {service.http_server.url}\n\nCtrl-C ends it.", flush=True)
         while time.monotonic() < end and not done.wait(min(1.0, end - time.monotonic())):
             pass
     return 0
@@ -158,9 +158,9 @@ def run_child(open_: OpenTwin, json: bool, name: str, path: str, pipe: Connectio
             pipe.send(("failed", str(error).splitlines()[0]))
         sys.exit(2)
     running.append(True)
-    assert session.door is not None
+    assert session.http_server is not None
     try:
-        pipe.send(("ready", (session.door.port, session.door.token, card)))
+        pipe.send(("ready", (session.http_server.port, session.http_server.token, card)))
         memory, measured = 0, -MEMORY_PERIOD_S
         while not (ending or done.is_set()):
             if time.monotonic() - measured > MEMORY_PERIOD_S:

@@ -11,7 +11,7 @@ import h11
 from starlette.responses import PlainTextResponse, Response
 from starlette.types import Receive, Scope, Send
 
-from app.web.gate import USER, User
+from app.web.access import USER, User
 
 from .supervisor import ServedTwin
 

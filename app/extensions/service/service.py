@@ -21,9 +21,9 @@ from starlette.staticfiles import StaticFiles
 from starlette.websockets import WebSocket
 
 from app.terminal import print_line
-from app.web.door import Door
-from app.web.gate import USER, User
+from app.web.access import USER, User
 from app.web.http import PAGE, get, page_file, post, refusal
+from app.web.http_server import HttpServer
 from app.web.request_threads import in_thread
 from app.web.viser_proxy import couple
 from config.yaml_files import yaml_files
@@ -61,15 +61,15 @@ class Overview(Protocol):
 class Service:
     """Starts the processes of twins, watches them, and serves their overview and pages."""
 
-    def __init__(self, supervisor: Supervisor, *, door: Door, overview: Overview | None = None) -> None:
-        """Add the routes to the door; nothing runs yet.
+    def __init__(self, supervisor: Supervisor, *, http_server: HttpServer, overview: Overview | None = None) -> None:
+        """Add the routes to the server; nothing runs yet.
 
         Args:
             supervisor: Starts the twins; with an overview on demand.
-            door: Serves the overview.
+            http_server: Serves the overview.
             overview: In place of the gallery, and of the twins.
         """
-        self.door, self._overview, self._supervisor = door, overview, supervisor
+        self.http_server, self._overview, self._supervisor = http_server, overview, supervisor
         self.twins = supervisor.twins
         routes = [
             get("/gallery", self._page),
@@ -82,20 +82,20 @@ class Service:
             WebSocketRoute("/twins/{name}/{path:path}", self._couple),
             Route("/api/{path:path}", self._elsewhere, methods=["GET", "POST"]),
         ]
-        door.add_gallery(routes, Starlette(routes=[get("/", self._page)]))
-        door.show(None, audit=self)
+        http_server.add_gallery(routes, Starlette(routes=[get("/", self._page)]))
+        http_server.show(None, audit=self)
 
     # From any thread
 
     def start(self) -> None:
         """Begin."""
         self._supervisor.start()
-        self.door.start()
+        self.http_server.start()
 
     def stop(self) -> None:
         """Stop all twins, concurrently, and the port."""
         self._supervisor.stop()
-        self.door.stop()
+        self.http_server.stop()
 
     def revision(self) -> None:
         """A service has twins, of which each has its revisions."""
@@ -130,14 +130,14 @@ class Service:
     def _page(self) -> Response:
         """Answer with the overview."""
         if self._overview is not None:
-            return self._overview.page(self.door.boot)
-        return page_file("gallery.html", {"boot": self.door.boot, "service": True}, title="Overview")
+            return self._overview.page(self.http_server.boot)
+        return page_file("gallery.html", {"boot": self.http_server.boot, "service": True}, title="Overview")
 
     def state(self) -> dict[str, Any]:
         """Return the state of each twin, the worst first."""
         twins = sorted(self.twins.values(), key=lambda twin: twin.rank)
         idle = {"running": None, "starting": None, "failed": None}
-        return {"boot": self.door.boot, **idle, "twins": [twin.json() for twin in twins]}
+        return {"boot": self.http_server.boot, **idle, "twins": [twin.json() for twin in twins]}
 
     def _cards(self) -> list[dict[str, Any]]:
         """Return a card for each twin."""

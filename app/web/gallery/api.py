@@ -31,14 +31,14 @@ PIECE_BYTES = 4 * 2**20
 
 
 class GalleryApi:
-    """Serves the gallery and one folder of recordings at the session's door, whatever runs."""
+    """Serves the gallery and one folder of recordings at the session's port, whatever runs."""
 
     def __init__(self, gallery: Gallery, recordings: Recordings) -> None:
-        """Add the routes to the door; before the session starts."""
+        """Add the routes to the HTTP server; before the session starts."""
         self._gallery, self._recordings = gallery, recordings
-        door = gallery.session.door
-        assert door is not None, "a gallery needs a page"
-        self._door = door
+        http_server = gallery.session.http_server
+        assert http_server is not None, "a gallery needs a page"
+        self._http_server = http_server
         self._logs = DroppedLogs(recordings, gallery.names, gallery.add)
         routes = [
             get("/gallery", self._page),
@@ -59,15 +59,15 @@ class GalleryApi:
             post("/api/gallery/log/draft", self._logs.draft, status=202),
             post("/api/gallery/log/draft/stop", self._logs.stop_draft),
         ]
-        door.add_gallery(routes, Starlette(routes=[get("/", self._page_at_once)]))
+        http_server.add_gallery(routes, Starlette(routes=[get("/", self._page_at_once)]))
 
     def _page(self) -> Response:
         """Answer with the page of the gallery."""
-        return page_file("gallery.html", {"boot": self._door.boot}, title="Gallery")
+        return page_file("gallery.html", {"boot": self._http_server.boot}, title="Gallery")
 
     def _page_at_once(self) -> Response:
         """Answer with the gallery where a twin's page will be."""
-        return page_file("gallery.html", {"boot": self._door.boot_without_twin}, title="Gallery")
+        return page_file("gallery.html", {"boot": self._http_server.boot_without_twin}, title="Gallery")
 
     def state(self) -> dict[str, Any]:
         """Return the running twin, the start under way, and the last start that failed."""
@@ -76,7 +76,7 @@ class GalleryApi:
         begun = gallery.compiling
         compiling = begun is not None and time.monotonic() - begun > COMPILING_SHOWN_AFTER_S
         return {
-            "boot": self._door.boot,
+            "boot": self._http_server.boot,
             "running": running
             and {
                 "name": request and request.twin,

@@ -159,8 +159,8 @@ class Gallery:
         try:
             self.session.change(lambda: self.session.prepared(opening), stop_first=both)
         except BaseException:
-            if opening.workshop is not None:
-                opening.workshop.stop()
+            if opening.compile_queue is not None:
+                opening.compile_queue.stop()
             raise
         self.running = wanted
 

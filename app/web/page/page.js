@@ -12,7 +12,7 @@ import { Link } from "./link.js";
 import { Runs } from "./runs.js";
 import { Save } from "./save.js";
 import { Leave } from "./session.js";
-import { Stage } from "./stage.js";
+import { SceneFrame } from "./scene_frame.js";
 import { Transport } from "./transport.js";
 import { Episodes, Trust, UserNotes } from "./trust.js";
 import { Tune } from "./tune.js";
@@ -84,7 +84,7 @@ new SharedTime(settings.boot, view, charts);
 view.addEventListener("change", () => link.point(view.at));
 const transport = new Transport(model, link, view, charts);
 const explore = new Explore(settings.viewer, theme, { link, view, charts });
-const stage = new Stage(settings.viser ? { pass: settings.stage_pass } : null, theme, link, view);
+const sceneFrame = new SceneFrame(settings.viser ? { pass: settings.stage_pass } : null, theme, link, view);
 
 // What is hidden neither computes nor asks.
 const panes = { explore, whatif: new WhatIf($("whatif"), model, link), diagnose: new Diagnose($("diagnose"), link, (...plot) => saving.plot(...plot)) };
@@ -139,11 +139,11 @@ view.addEventListener("change", () => location.hash && !arriving && history.repl
 const turn = (name) => middle.show(middle.chosen === name ? "charts-panel" : name);
 const xy = (window.nisus.xy = new XY($("xy"), model, link, view, charts));
 xy.saving = saving;
-let stages = false;
+let chartsDrawn = false;
 middle.show("charts-panel");
 side.shown = (name) => {
   xy.visible(name === "xy");
-  if (stages) stage.visible(name === "scene");
+  if (chartsDrawn) sceneFrame.visible(name === "scene");
 };
 side.show(side.chosen ?? "scene");
 // Where there is no room for three columns, one list of tabs has all panels; see style.css.
@@ -152,7 +152,7 @@ const arrange = () => side.join(narrow.matches ? middle : null);
 narrow.addEventListener("change", arrange);
 arrange();
 // The scene once the charts stand: its three.js keeps the page busy while it starts.
-link.addEventListener("frames", () => setTimeout(() => ((stages = true), side.shown(side.current)), 300), { once: true });
+link.addEventListener("frames", () => setTimeout(() => ((chartsDrawn = true), side.shown(side.current)), 300), { once: true });
 
 async function record() {
   if (link.status.recording) await link.ask("Record", { path: null });
@@ -203,7 +203,7 @@ keys([
   ["b", "switch to the previous run and back", () => runs.swap()],
   ["e", "episodes", () => side.show("episodes")],
   ["y", "state over state (XY)", () => side.show("xy")],
-  ["s", "scene; again: enlarge or shrink", () => (side.current === "scene" ? stage.enlarge() : side.show("scene"))],
+  ["s", "scene; again: enlarge or shrink", () => (side.current === "scene" ? sceneFrame.enlarge() : side.show("scene"))],
   ["x", "explore in Rerun", () => turn("explore")],
   ["w", "what if", () => turn("whatif")],
   ["d", "diagnose", () => turn("diagnose")],

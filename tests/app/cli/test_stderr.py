@@ -5,7 +5,7 @@ import pytest
 import app.cli.open_twin
 import app.cli.prepare
 from app.cli.main import main
-from app.engine.workshop import Workshop
+from app.engine.compile_queue import CompileQueue
 from app.terminal import printable
 from tests.app.cli.test_fold import DRIVE, ROWS
 
@@ -84,7 +84,7 @@ def test_files_of_a_source_are_looked_at_before_anything_is_compiled(drive, opti
     def too_late(*_):
         raise AssertionError("it went on")
 
-    monkeypatch.setattr(app.cli.open_twin, "begin_to_compile", lambda *_: Workshop())
+    monkeypatch.setattr(app.cli.open_twin, "begin_to_compile", lambda *_: CompileQueue())
     monkeypatch.setattr(app.cli.open_twin, "compile_for", too_late)
     monkeypatch.setattr(app.cli.prepare, "attend", too_late)
     (drive / "drive.csv").write_text("t,y\n0,1\n")

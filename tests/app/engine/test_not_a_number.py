@@ -112,17 +112,17 @@ def shown(scene):
 
 
 def test_the_scene_drops_the_filter_before_and_shows_what_is_there_again(view):
-    assert shown(view.stage.scene) == (True, True, True)
+    assert shown(view.renderer.scene) == (True, True, True)
     view.engine.submit(SetEstimator("ekf"))
     assert np.isnan(view.engine.belief().mean).any()
     view.frame()
-    assert shown(view.stage.scene) == (False, False, False)
+    assert shown(view.renderer.scene) == (False, False, False)
     view.engine.put(reset())
     view.engine.put(fixes(RESET_AT + 1, END))
     view.frame()
     assert np.isfinite(view.engine.belief().mean).all()
     # A Gaussian filter has no cloud.
-    assert shown(view.stage.scene) == (True, True, False)
+    assert shown(view.renderer.scene) == (True, True, False)
 
 
 def test_the_other_charts_end_their_lines_and_pictures_and_begin_them_anew(rail, tmp_path):

@@ -35,7 +35,7 @@ class Session(Stepped):
         self.source = source or Scripted(live=True)
         self.twin = twin or load_twin("motor_winding", overrides={"history": "2048"})
         make = self.source if callable(self.source) else lambda report: self.source
-        self.running = RunningTwin(OpenedTwin(self.twin, make, store=path, **options), door=None)
+        self.running = RunningTwin(OpenedTwin(self.twin, make, store=path, **options), http_server=None)
         self.engine = self.running.engine
         self.engine.settle()
 

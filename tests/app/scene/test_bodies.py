@@ -7,7 +7,7 @@ import pytest
 
 from app.charts.colors import ESTIMATE, LIGHT, gradient
 from app.scene.machine_scenes import HEIGHT, BatteryScene, MotorScene, mesh, sectors
-from app.scene.stage import NO_AXIS, Choice, Choices, choices_of
+from app.scene.renderer import NO_AXIS, Choice, Choices, choices_of
 from config.schema import SceneSection, ViewSection
 from estimators.errors import ConfigError
 from estimators.models import MODELS

@@ -44,11 +44,11 @@ def page(browser, view):
 def test_each_pane_gets_a_camera_that_fills_it(page, view):
     """A pane that grows higher moves its camera; one whose user turns it is left alone."""
     (client,) = view.server.get_clients().values()
-    wait_for(lambda: np.allclose(client.camera.position, place(view.stage.scene.outlook, client.camera.aspect)[0]))
+    wait_for(lambda: np.allclose(client.camera.position, place(view.renderer.scene.outlook, client.camera.aspect)[0]))
     wide = client.camera.position.copy()
     page.set_viewport_size({"width": 600, "height": 1000})
     wait_for(lambda: np.linalg.norm(client.camera.position) > 1.3 * np.linalg.norm(wide))
     page.mouse.move(100, 500)
     page.mouse.wheel(0, -400)
-    fitted = place(view.stage.scene.outlook, client.camera.aspect)[0]
+    fitted = place(view.renderer.scene.outlook, client.camera.aspect)[0]
     wait_for(lambda: np.linalg.norm(client.camera.position) < 0.98 * np.linalg.norm(fitted))

@@ -184,11 +184,11 @@ def test_nothing_new_is_not_drawn_again(view, engine):
 
 def test_belief_scene_follows_the_estimate(view, engine):
     belief = engine.belief()
-    axes = view.stage.scene.axes
+    axes = view.renderer.scene.axes
     place = [axis.place(belief.mean[axis.state]) for axis in axes]
-    np.testing.assert_allclose(view.stage.scene._belief.position[:2], place, atol=1e-6)
+    np.testing.assert_allclose(view.renderer.scene._belief.position[:2], place, atol=1e-6)
     assert np.all(np.abs(place) < 1.0)
-    labels = [float(label.text) for label in view.stage.scene._labels[0]]
+    labels = [float(label.text) for label in view.renderer.scene._labels[0]]
     assert labels[0] < belief.mean[0] < labels[-1]
 
 
@@ -198,20 +198,20 @@ def test_blocks_of_true_states_are_drawn(engine, framed):
     block = np.stack((50.0 + t, [0.1, np.nan, 0.3, 0.4, np.nan]), axis=1)
     engine.put(events(WINDING, TRUTH, 0, t, block))
     view = framed(engine)
-    np.testing.assert_array_equal(view.stage.scene._true_point(view.history, [1, 0]), [[0.4, 154.0]])
+    np.testing.assert_array_equal(view.renderer.scene._true_point(view.history, [1, 0]), [[0.4, 154.0]])
 
 
 def test_peaks_are_marked_with_their_weights_while_there_are_several(view, engine):
     belief = engine.belief()
     std = np.sqrt(np.diag(belief.cov))
     peaks = tuple(Peak(weight, belief.mean + side * std, belief.cov) for weight, side in ((0.75, 0.5), (0.25, -0.5)))
-    view.stage.scene.draw(view.history, replace(belief, peaks=peaks))
-    (first, heavy), (second, light), (third, _) = view.stage.scene._marks.handles[:3]
+    view.renderer.scene.draw(view.history, replace(belief, peaks=peaks))
+    (first, heavy), (second, light), (third, _) = view.renderer.scene._marks.handles[:3]
     assert first.visible and second.visible and not third.visible
     assert (heavy.text, light.text) == ("75 %", "25 %")
-    place = [axis.place(peaks[1].mean[axis.state]) for axis in view.stage.scene.axes]
+    place = [axis.place(peaks[1].mean[axis.state]) for axis in view.renderer.scene.axes]
     np.testing.assert_allclose(second.points[0, : len(place)], place[:3], atol=0.05)
-    view.stage.scene.draw(view.history, belief)
+    view.renderer.scene.draw(view.history, belief)
     assert not (first.visible or second.visible)
 
 
@@ -279,12 +279,12 @@ def test_vehicle_scene_keeps_the_vehicle_in_the_middle(framed):
     north = np.where(t == 30.0, np.nan, 3.0)
     engine.put(events(model, TRUTH, 0, t, np.stack((10 * t, north), axis=1)))
     view = framed(engine)
-    np.testing.assert_allclose(view.stage.scene.world.position, [-600.0, 0.0, 0.0], atol=2.0)
-    np.testing.assert_allclose(view.stage.scene._vehicle.position[:2], engine.belief().mean[:2], atol=1e-6)
-    assert view.stage.scene._readings.points.shape == (60, 3)
-    way = np.unique(np.asarray(view.stage.scene._truth.points).reshape(-1, 3), axis=0)
+    np.testing.assert_allclose(view.renderer.scene.world.position, [-600.0, 0.0, 0.0], atol=2.0)
+    np.testing.assert_allclose(view.renderer.scene._vehicle.position[:2], engine.belief().mean[:2], atol=1e-6)
+    assert view.renderer.scene._readings.points.shape == (60, 3)
+    way = np.unique(np.asarray(view.renderer.scene._truth.points).reshape(-1, 3), axis=0)
     np.testing.assert_allclose(way[:, 0], 10 * t[t != 30.0], err_msg="where both true states are known")
     np.testing.assert_allclose(way[:, 1], 3.0)
-    assert view.stage.scene._course == pytest.approx(0.0, abs=0.05)
+    assert view.renderer.scene._course == pytest.approx(0.0, abs=0.05)
     cov = engine.belief().cov[:2, :2]
-    np.testing.assert_allclose(view.stage.scene._ellipse.scale[:2], 2 * np.sqrt(np.linalg.eigvalsh(cov)), rtol=1e-6)
+    np.testing.assert_allclose(view.renderer.scene._ellipse.scale[:2], 2 * np.sqrt(np.linalg.eigvalsh(cov)), rtol=1e-6)

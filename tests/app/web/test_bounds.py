@@ -16,12 +16,12 @@ from starlette.responses import PlainTextResponse
 from websockets.exceptions import ConnectionClosed, InvalidStatus
 
 from app.scene import guarded_server as private_viser
-from app.web import door
-from app.web.door import MAX_CONNECTIONS as CONNECTIONS
-from app.web.gate import Grant
+from app.web import http_server
+from app.web.access import Grant
 from app.web.http import MAX_BODY_BYTES as BODY
+from app.web.http_server import MAX_CONNECTIONS as CONNECTIONS
 from tests.app.scripted import Replayed, readings
-from tests.app.web.test_door import STREAM
+from tests.app.web.test_http_server import STREAM
 from tests.waiting import LIMIT_S, wait_for
 
 HALF = b"GET /api/status HTTP/1.1\r\nHost: 127.0.0.1"
@@ -66,13 +66,13 @@ def test_many_half_open_connections_leave_room_for_an_honest_one(page):
      b"GET /viser/ HTTP/1.1\r\nUpgrade: websocket\r\n"],
 )  # fmt: skip
 def test_a_header_that_does_not_end_is_not_waited_for(page, monkeypatch, sent):
-    monkeypatch.setattr(door, "REQUEST_TIMEOUT_S", 0.3)
+    monkeypatch.setattr(http_server, "REQUEST_TIMEOUT_S", 0.3)
     with half_open(page.client.port, sent) as sock:
         assert b"200 OK" not in sock.recv(65536)
 
 
 def test_a_header_that_trickles_is_not_waited_for_either(page, monkeypatch):
-    monkeypatch.setattr(door, "REQUEST_TIMEOUT_S", 0.3)
+    monkeypatch.setattr(http_server, "REQUEST_TIMEOUT_S", 0.3)
     client = page.client
     first = f"GET /api/status HTTP/1.1\r\nHost: {client.host}\r\nCookie: {client.cookie}\r\n\r\n".encode()
     with half_open(client.port, first) as sock:
@@ -99,7 +99,7 @@ def test_a_body_that_does_not_end_is_not_waited_for(page, monkeypatch):
     client = page.client
     head = f"Host: {client.host}\r\nCookie: {client.cookie}\r\nOrigin: {client.origin}\r\n"
     kind = "Content-Type: application/json\r\nContent-Length: 40\r\n\r\n{"
-    monkeypatch.setattr(door, "REQUEST_TIMEOUT_S", 0.3)
+    monkeypatch.setattr(http_server, "REQUEST_TIMEOUT_S", 0.3)
     with half_open(client.port, f"POST /api/command HTTP/1.1\r\n{head}{kind}".encode()) as sock:
         assert b"HTTP/1.1 202" not in sock.recv(65536)
 
@@ -123,7 +123,7 @@ def test_the_private_viser_server_is_not_crowded_out_either(monkeypatch, capfd):
 @pytest.mark.parametrize("role, held", [("view", [24, 24, 16, 0]), ("tune", [24, 24, 24, 8]), ("admin", [88, 0, 0, 0])])
 def test_streams_of_some_users_leave_room_for_the_owner_and_for_health(role, held):
     grants = [Grant(name, role, hashlib.sha256(name.encode()).hexdigest()) for name in "abcd"]
-    served = door.Door(0, grants)
+    served = http_server.HttpServer(0, grants)
 
     async def hold(scope, receive, send):
         while scope["path"] == "/stream" and (await receive())["type"] != "http.disconnect":

@@ -18,7 +18,7 @@ import app.cli.run
 from app.cli.main import main
 from app.engine.engine import Engine
 from app.web import session as session_module
-from app.web.door import FormerSessions, check_port
+from app.web.http_server import FormerSessions, check_port
 from app.web.server import PageServer
 from app.web.session import BrowserPage
 from estimators.errors import ConfigError

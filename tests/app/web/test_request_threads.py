@@ -10,7 +10,7 @@ import pytest
 from starlette.responses import PlainTextResponse
 
 from app.charts.series import Series
-from app.web.door import Door
+from app.web.http_server import HttpServer
 from app.web.request_threads import REQUEST_THREADS, in_thread
 from app.web.streams import PageStream
 from tests.app.scripted import Stepped, notice_texts
@@ -18,7 +18,7 @@ from tests.waiting import LIMIT_S, wait_for
 
 
 def test_requests_share_the_stated_number_of_threads():
-    served, go_on, at_work = Door(0), threading.Event(), []
+    served, go_on, at_work = HttpServer(0), threading.Event(), []
 
     def wait():
         at_work.append(threading.current_thread())

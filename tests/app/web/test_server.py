@@ -12,7 +12,7 @@ import pytest
 
 from app.engine.engine import Engine
 from app.web import viewer_assets as assets_module
-from app.web.gate import USER, Gate, read_tokens
+from app.web.access import USER, AccessControl, read_tokens
 from app.web.server import PageServer
 from app.web.viewer_assets import FILES, viewer_assets, viewer_version
 from estimators.errors import ConfigError
@@ -63,8 +63,8 @@ TOKEN = "t" * 40
 OWN = "127.0.0.1:9900"
 
 
-def ask(gate, path="/", query="", method="GET", host=OWN, **headers):
-    """Status and headers that a gate answers with; 299 is the application behind it."""
+def ask(access, path="/", query="", method="GET", host=OWN, **headers):
+    """Status and headers that the access control answers with; 299 is the application behind it."""
     sent = []
 
     async def send(message):
@@ -72,7 +72,7 @@ def ask(gate, path="/", query="", method="GET", host=OWN, **headers):
 
     raw = [(name.replace("_", "-").encode(), value.encode()) for name, value in {"host": host, **headers}.items()]
     scope = {"type": "http", "method": method, "path": path, "query_string": query.encode(), "headers": raw}
-    asyncio.run(gate(scope, None, send))
+    asyncio.run(access(scope, None, send))
     return sent[0]["status"], dict(sent[0]["headers"]), sent[1]["body"] if len(sent) > 1 else b""
 
 
@@ -80,27 +80,27 @@ async def behind(scope, receive, send):
     await send({"type": "http.response.start", "status": 299, "headers": []})
 
 
-def gate_of(**more):
-    return Gate(behind, TOKEN, 9900, **more)
+def access_of(**more):
+    return AccessControl(behind, TOKEN, 9900, **more)
 
 
 @pytest.mark.parametrize("site, status", [("same-origin", 299), ("none", 299), ("same-site", 403), ("cross-site", 403)])
 def test_what_the_browser_says_of_a_request_without_origin_is_heard(site, status):
-    _, headers, _ = ask(gate_of(), query=f"token={TOKEN}")
+    _, headers, _ = ask(access_of(), query=f"token={TOKEN}")
     cookie = headers[b"set-cookie"].decode().partition(";")[0]
-    asked = ask(gate_of(), "/rec/a.rrd", cookie=cookie, sec_fetch_site=site)
+    asked = ask(access_of(), "/rec/a.rrd", cookie=cookie, sec_fetch_site=site)
     assert asked[0] == status
 
 
 def test_a_link_from_elsewhere_opens_the_page_without_a_redirect():
     # A strict cookie is not sent along a redirect that another site began.
-    status, headers, body = ask(gate_of(), query=f"token={TOKEN}", host="localhost:9900", sec_fetch_site="cross-site")
+    status, headers, body = ask(access_of(), query=f"token={TOKEN}", host="localhost:9900", sec_fetch_site="cross-site")
     assert status == 200 and b"set-cookie" in headers and b"refresh" in body and TOKEN.encode() not in body
 
 
 def test_a_script_may_send_the_token_as_a_header():
-    assert ask(gate_of(), "/api/status", authorization=f"Bearer {TOKEN}")[0] == 299
-    assert ask(gate_of(), "/api/status", authorization="Bearer another")[0] == 403
+    assert ask(access_of(), "/api/status", authorization=f"Bearer {TOKEN}")[0] == 299
+    assert ask(access_of(), "/api/status", authorization="Bearer another")[0] == 403
 
 
 def tokens_file(folder, text, mode=0o600):
@@ -122,7 +122,7 @@ def test_a_token_of_a_file_opens_what_its_role_allows(tmp_path, role):
     token = "secret-of-another-program"
     grants = read_tokens(tokens_file(tmp_path, f"# who may do what\n\nprometheus {role} {token}  # since Monday\n"))
     assert token not in repr(grants)
-    gate = gate_of(grants=grants)
+    access = access_of(grants=grants)
     every = [
         "GET /", "GET /api/status", "GET /metrics", "GET /api/readings", "POST /api/readings", "POST /api/command",
         "GET /viser/", "POST /api/gallery/recordings/delete",
@@ -131,12 +131,12 @@ def test_a_token_of_a_file_opens_what_its_role_allows(tmp_path, role):
     for words in every:
         method, path = words.split()
         bearer = f"Bearer {token}"
-        status, _, body = ask(gate, path, method=method, authorization=bearer)
+        status, _, body = ask(access, path, method=method, authorization=bearer)
         assert status == (299 if words in allowed else 403), words
         if status == 403:
             assert body.startswith(f"Nisus: the token of prometheus has the role {role}; this needs ".encode())
-        assert ask(gate, path, method=method, authorization="Bearer secret")[0] == 403
-        assert ask(gate, path, method=method, authorization=bearer, origin="http://elsewhere")[0] == 403
+        assert ask(access, path, method=method, authorization="Bearer secret")[0] == 403
+        assert ask(access, path, method=method, authorization=bearer, origin="http://elsewhere")[0] == 403
 
 
 @cases(__file__, "wrong_tokens.csv")
@@ -148,11 +148,11 @@ def test_a_wrong_file_of_tokens_is_one_line(nisus, tmp_path, text, mode, reason)
 
 @cases(__file__, "addresses.csv")
 def test_a_service_on_other_addresses_has_its_own_names_only(host, origin, status):
-    gate = gate_of(addresses=True, public="https://twins.example.com")
+    access = access_of(addresses=True, public="https://twins.example.com")
     headers = {"host": host, "authorization": f"Bearer {TOKEN}"} | ({"origin": origin} if origin else {})
-    assert ask(gate, "/api/state", **headers)[0] == int(status)
+    assert ask(access, "/api/state", **headers)[0] == int(status)
     if host != OWN:
-        assert ask(gate_of(), "/api/state", **headers)[0] == 403
+        assert ask(access_of(), "/api/state", **headers)[0] == 403
 
 
 @pytest.mark.parametrize(
@@ -166,11 +166,11 @@ def test_the_user_that_is_noted_cannot_be_changed_by_the_address_a_proxy_names(t
         found.append(scope[USER])
         await behind(scope, receive, send)
 
-    service = Gate(
+    service = AccessControl(
         noted, TOKEN, 9900, public="https://twins.example.com",
         grants=read_tokens(tokens_file(tmp_path, f"bob tune {'b' * 20}\n")),
     )  # fmt: skip
-    twin = Gate(noted, "u" * 40, 9901)
+    twin = AccessControl(noted, "u" * 40, 9901)
     ask(service, "/api/state", host="twins.example.com", authorization="Bearer " + "b" * 20, x_forwarded_for=named)
     ask(twin, "/api/state", host="127.0.0.1:9901", authorization="Bearer " + "u" * 40, nisus_user=" ".join(found[0]))
     assert found == [("bob", "tune", address)] * 2
@@ -178,18 +178,18 @@ def test_the_user_that_is_noted_cannot_be_changed_by_the_address_a_proxy_names(t
 
 @pytest.mark.parametrize("role", ["view", "feed", "tune", "admin"])
 def test_a_role_is_the_same_for_one_twin_of_several(tmp_path, role):
-    gate = gate_of(grants=read_tokens(tokens_file(tmp_path, f"ann {role} {'a' * 20}\n")))
+    access = access_of(grants=read_tokens(tokens_file(tmp_path, f"ann {role} {'a' * 20}\n")))
     ann = "Bearer " + "a" * 20
     for words in ("GET /api/state", "GET /viser/", "POST /api/readings", "POST /api/command"):
         method, path = words.split()
-        alone, among = (ask(gate, begin + path, method=method, authorization=ann)[0] for begin in ("", "/twins/pump"))
+        alone, among = (ask(access, begin + path, method=method, authorization=ann)[0] for begin in ("", "/twins/pump"))
         assert alone == among, words
 
 
 def test_the_cookie_of_one_port_does_not_open_another():
-    _, headers, _ = ask(gate_of(), query=f"token={TOKEN}")
+    _, headers, _ = ask(access_of(), query=f"token={TOKEN}")
     value = headers[b"set-cookie"].decode().partition(";")[0].partition("=")[2]
-    assert ask(Gate(behind, TOKEN, 9901), host="127.0.0.1:9901", cookie=f"nisus_9901={value}")[0] == 403
+    assert ask(AccessControl(behind, TOKEN, 9901), host="127.0.0.1:9901", cookie=f"nisus_9901={value}")[0] == 403
 
 
 def test_viewer_files_are_compressed_and_kept_for_ever(tmp_path, monkeypatch):

@@ -39,7 +39,8 @@ def test_the_address_of_a_page_is_that_of_its_proxy_or_service():
         session.Page(0, False, public="https://a.example"),
         session.Page(0, False, site="x/y"),
     )
-    doors = [session.Session(None, page=page).door for page in pages]
-    assert [door.site for door in doors] == [f"http://127.0.0.1:{doors[0].port}", "https://a.example", "x/y"]
-    for door in doors:
-        door.stop()
+    servers = [session.Session(None, page=page).http_server for page in pages]
+    own = f"http://127.0.0.1:{servers[0].port}"
+    assert [server.site for server in servers] == [own, "https://a.example", "x/y"]
+    for server in servers:
+        server.stop()

@@ -1,4 +1,4 @@
-"""The log's door: what no model has a place for is refused, and the log stays as it was."""
+"""Checks of the log on entry: what no model has a place for is refused, and the log stays as it was."""
 
 import json
 

@@ -149,7 +149,7 @@ def test_a_restart_from_a_store_takes_no_row_twice(tmp_path):
 
     def begin():
         running = RunningTwin(
-            OpenedTwin(twin, lambda report: twin.open_source(report, speed=None), store=store), door=None
+            OpenedTwin(twin, lambda report: twin.open_source(report, speed=None), store=store), http_server=None
         )
         assert running.engine.source.live
         return running

@@ -208,7 +208,8 @@ from tests.waiting import wait_for
 
 folder, first, value = Path(sys.argv[1]), int(sys.argv[2]), float(sys.argv[3])
 twin = started({"log": {"type": "webhook", "url": sys.argv[4]}})
-running = RunningTwin(OpenedTwin(twin, lambda report: twin.open_source(ignore), store=folder / "a.store"), door=None)
+opening = OpenedTwin(twin, lambda report: twin.open_source(ignore), store=folder / "a.store")
+running = RunningTwin(opening, http_server=None)
 running.start()
 source = running.engine.innermost
 for k in range(first, first + 60):

@@ -1,4 +1,4 @@
-"""A session with its gallery, and a client at its door."""
+"""A session with its gallery, and a client of its server."""
 
 import json
 from contextlib import contextmanager
@@ -15,7 +15,7 @@ class Opened:
 
     def __init__(self, session):
         self.session = session
-        self.client = Client(session.door)
+        self.client = Client(session.http_server)
 
     @property
     def engine(self):

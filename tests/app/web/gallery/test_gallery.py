@@ -121,9 +121,9 @@ def test_a_twin_that_is_started_says_that_its_model_is_compiled(tmp_path, monkey
 def test_a_gallery_in_place_of_a_twin_that_came_since_reloads(tmp_path):
     with opened(tmp_path) as session:
         boot = session.state()["boot"]
-        assert session.session.door.boot_without_twin == boot and boot in session.client.get("/").text
+        assert session.session.http_server.boot_without_twin == boot and boot in session.client.get("/").text
         session.start("motor_winding")
-        assert session.session.door.boot_without_twin == ""
+        assert session.session.http_server.boot_without_twin == ""
 
 
 def test_one_twin_after_another_behind_one_port(tmp_path):

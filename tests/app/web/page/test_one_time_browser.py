@@ -206,7 +206,7 @@ def test_strip_and_scene_show_the_moment_of_the_cursor(visit, session):
     shows(other, engine.status_at(origin + 11 * 10**9), "at 0:11.0")
     shows(page, then, "at 0:11.0, 30 s earlier than the charts")
     other.close()
-    wait_for(lambda: view.stage.choices.at is None)
+    wait_for(lambda: view.renderer.choices.at is None)
     shows(page, then, f"at {int(end // 60)}:{end % 60:04.1f}, {round(end - 41.03)} s later than the charts")
 
     # Back at the newest row; a folded recording offers the whole of it, and no newest row.

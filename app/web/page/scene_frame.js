@@ -1,4 +1,4 @@
-// The stage: Viser's scene in a frame, and the choices about it, which also hold for a window of its own.
+// Viser's scene in a frame, and the choices about it, which also hold for a window of its own.
 
 import { $, changed, element, setAttribute, setText } from "./dom.js";
 import { clock, span, words } from "./format.js";
@@ -7,7 +7,7 @@ import { post } from "./http.js";
 const MAX_LEAD_S = 1; // s by which the scene may differ from the charts without a word
 const LARGE = "nisus.stage.large";
 
-export class Stage {
+export class SceneFrame {
   constructor(there, theme, link, view) {
     Object.assign(this, { there, theme, link });
     this.frame = $("stage");

@@ -14,9 +14,9 @@ import numpy as np
 import pytest
 
 from app.engine.commands import Record, SetEstimator, SetTuning
+from app.engine.compile_queue import CompileQueue
 from app.engine.compilers import MAX_COMPILERS, Compiler, first_compilers
 from app.engine.engine import Engine
-from app.engine.workshop import Workshop
 from app.record.reader import read_recording
 from app.record.writer import Recorder
 from estimators.fold import Fold
@@ -51,7 +51,7 @@ def slow_work(folder: Path, piece: Piece) -> None:
 
 @pytest.fixture
 def shop(tmp_path):
-    """A workshop whose work is `slow_work`; each filter given is as many pieces as its number says."""
+    """A queue whose work is `slow_work`; each filter given is as many pieces as its number says."""
     shops = []
 
     def open_shop(**counts):
@@ -59,7 +59,7 @@ def shop(tmp_path):
         if LOOP in pieces:
             pieces[LOOP][-1] = Piece(LOOP, counts[LOOP] - 1, tuple(range(counts[LOOP] - 1)))
         shops.append(
-            Workshop(
+            CompileQueue(
                 [name for name in counts if name != LOOP],
                 pieces=lambda name: pieces.get(name, []),
                 work=partial(slow_work, tmp_path),
@@ -78,9 +78,9 @@ def started(shop):
     engines = []
 
     def start(**counts):
-        source, workshop = Scripted(), shop(**counts)
-        workshop.start()
-        engine = Engine(twin(), lambda report: source, workshop=workshop)
+        source, compile_queue = Scripted(), shop(**counts)
+        compile_queue.start()
+        engine = Engine(twin(), lambda report: source, compile_queue=compile_queue)
         engines.append(engine)
         engine.start()
         return engine, source
@@ -144,8 +144,8 @@ def test_before_the_first_filter_is_compiled_the_log_grows_and_nothing_is_estima
     assert run.number == fresh_status(engine).revision == 0 and run.tuning.get("Q.rate") == 0.5
 
 
-class OneFilter(Workshop):
-    """A workshop that says whether its filter is compiled."""
+class OneFilter(CompileQueue):
+    """A queue that says whether its filter is compiled."""
 
     compiled = False
 
@@ -155,12 +155,12 @@ class OneFilter(Workshop):
 
 def test_a_late_reading_reaches_the_first_fold_that_was_begun_without_it():
     """The first refold has copied the log when a reading of before the copy's end arrives; no event is folded yet."""
-    source, workshop, (times, values) = Scripted(), OneFilter(), series(300)
-    engine = Engine(twin(), lambda report: source, workshop=workshop)
+    source, compile_queue, (times, values) = Scripted(), OneFilter(), series(300)
+    engine = Engine(twin(), lambda report: source, compile_queue=compile_queue)
     source.put(readings(np.delete(times, 100), np.delete(values, 100)))
     engine.settle()
     assert engine.status().t is None
-    workshop.compiled = True
+    compile_queue.compiled = True
     engine.submit(SetTuning("R.winding", 2.0))
     source.put(readings(times[100:101], values[100:101]))
     engine.settle()
@@ -207,31 +207,31 @@ def test_who_chooses_another_filter_meanwhile_gets_that(started, tmp_path):
 
 
 def test_what_is_asked_for_comes_first_and_the_rest_is_done_at_the_lowest_priority(shop, tmp_path):
-    workshop, told = shop(ukf=1, ckf=1, pf=1), []
-    workshop.start()
+    compile_queue, told = shop(ukf=1, ckf=1, pf=1), []
+    compile_queue.start()
     wait_for(lambda: begun(tmp_path, Piece("ukf", 0)))
-    workshop.ask("pf", told.append)
+    compile_queue.ask("pf", told.append)
     wait_for(lambda: begun(tmp_path, Piece("pf", 0)))
     assert begun(tmp_path, Piece("ckf", 0)) is None and not told
-    states = workshop.states()
+    states = compile_queue.states()
     assert states["ckf"] is None and states["pf"] >= 0.0 and states["ukf"] >= 0.0
     assert begun(tmp_path, Piece("pf", 0))[1] == os.nice(0)
     (tmp_path / "go").touch()
-    wait_for(lambda: not workshop.states())
-    assert told == ["pf"] and workshop.ready("ckf")
+    wait_for(lambda: not compile_queue.states())
+    assert told == ["pf"] and compile_queue.ready("ckf")
     for name in ("ukf", "ckf"):
         assert begun(tmp_path, Piece(name, 0))[1] == 19
     asked = []
-    workshop.ask("ukf", asked.append)
+    compile_queue.ask("ukf", asked.append)
     assert asked == ["ukf"]
 
 
-def test_what_fails_in_the_workshop_is_left_to_who_uses_it(shop, tmp_path):
-    workshop, told = shop(ukf=1, ckf=2), []
+def test_what_fails_in_the_queue_is_left_to_who_uses_it(shop, tmp_path):
+    compile_queue, told = shop(ukf=1, ckf=2), []
     paper(tmp_path, "fail", Piece("ukf", 0)).touch()
-    workshop.start()
-    workshop.ask("ukf", told.append)
-    workshop.ask("ckf", told.append)
+    compile_queue.start()
+    compile_queue.ask("ukf", told.append)
+    compile_queue.ask("ckf", told.append)
     wait_for(lambda: begun(tmp_path, Piece("ukf", 0)) and begun(tmp_path, Piece("ckf", 0)))
     paper(tmp_path, "go", Piece("ukf", 0)).touch()
     wait_for(lambda: told == ["ukf"])
@@ -251,18 +251,18 @@ def killed(tmp_path, piece, *others):
 
 
 def test_what_was_ended_from_outside_is_begun_once_more_and_said(shop, tmp_path):
-    workshop, told, said = shop(enkf=3), [], []
-    workshop.report = said.append
+    compile_queue, told, said = shop(enkf=3), [], []
+    compile_queue.report = said.append
     first, last = Piece("enkf", 0), Piece("enkf", 2)
     for place in (1, 2):
         paper(tmp_path, "go", Piece("enkf", place)).touch()
-    workshop.start()
-    workshop.ask("enkf", told.append)
+    compile_queue.start()
+    compile_queue.ask("enkf", told.append)
     process = killed(tmp_path, first)
     wait_for(lambda: len(said) == 1)
     assert "enkf was killed" in said[0] and said[0].endswith("compiled again")
     wait_for(lambda: begun(tmp_path, first)[0] != process and paper(tmp_path, "done", last).exists())
-    assert not told and not workshop.ready("enkf")
+    assert not told and not compile_queue.ready("enkf")
     # Twice is no accident: who uses it compiles it.
     killed(tmp_path, first, process)
     wait_for(lambda: told == ["enkf"])
@@ -284,36 +284,36 @@ def test_the_engine_says_that_a_compiler_was_ended_and_folds_with_the_filter_all
 
 
 def test_what_a_source_needs_comes_first_and_is_waited_for_alone(shop, tmp_path):
-    workshop = shop(**{LOOP: 1, "ukf": 4, FRAMES: 1})
-    waiting = threading.Thread(target=workshop.wait, args=(FRAMES,), daemon=True)
+    compile_queue = shop(**{LOOP: 1, "ukf": 4, FRAMES: 1})
+    waiting = threading.Thread(target=compile_queue.wait, args=(FRAMES,), daemon=True)
     for name in ("ukf", FRAMES):
-        workshop.ask(name)
+        compile_queue.ask(name)
     waiting.start()
-    workshop.start()
+    compile_queue.start()
     wait_for(lambda: begun(tmp_path, Piece(FRAMES, 0)))
-    assert list(workshop.states()) == ["ukf"]
+    assert list(compile_queue.states()) == ["ukf"]
     paper(tmp_path, "go", Piece(FRAMES, 0)).touch()
     wait_for(lambda: not waiting.is_alive())
-    assert workshop.ready(FRAMES) and not workshop.ready("ukf")
-    # Who waits when the workshop is closed is let go.
-    waiting = threading.Thread(target=workshop.wait, args=("ukf",), daemon=True)
+    assert compile_queue.ready(FRAMES) and not compile_queue.ready("ukf")
+    # Who waits when the compile_queue is closed is let go.
+    waiting = threading.Thread(target=compile_queue.wait, args=("ukf",), daemon=True)
     waiting.start()
-    workshop.stop()
+    compile_queue.stop()
     waiting.join(LIMIT_S)
     assert not waiting.is_alive()
 
 
-def test_workers_that_began_before_the_workshop_compile_in_it(tmp_path):
+def test_workers_that_began_before_the_queue_compile_in_it(tmp_path):
     worker, other = (Compiler(partial(slow_work, tmp_path), 0) for _ in range(2))
     piece = Piece("ukf", 0)
     pieces = {"ukf": [piece]}
-    busy = Workshop(["ukf"], pieces=lambda name: pieces.get(name, []), is_done=lambda _: False, workers=[worker])
+    busy = CompileQueue(["ukf"], pieces=lambda name: pieces.get(name, []), is_done=lambda _: False, workers=[worker])
     busy.ask("ukf")
     busy.start()
     wait_for(lambda: begun(tmp_path, piece))
     assert begun(tmp_path, piece)[0] == worker._process.pid
     busy.stop()
-    idle = Workshop(["ukf"], pieces=lambda _: [], workers=[other])
+    idle = CompileQueue(["ukf"], pieces=lambda _: [], workers=[other])
     idle.start()
     assert not worker._process.alive and not other._process.alive
 
@@ -330,11 +330,11 @@ def test_workers_begin_before_all_else_only_where_nothing_was_compiled(tmp_path,
 
 
 def test_nothing_is_left_running(shop, tmp_path):
-    workshop = shop(ukf=1)
-    workshop.start()
+    compile_queue = shop(ukf=1)
+    compile_queue.start()
     wait_for(lambda: begun(tmp_path, Piece("ukf", 0)))
     process = begun(tmp_path, Piece("ukf", 0))[0]
-    workshop.stop()
+    compile_queue.stop()
     wait_for(lambda: not Path(f"/proc/{process}").exists())  # `stop` waits for 2 s only
 
 

@@ -12,7 +12,7 @@ import viser
 from rerun.chunk import RrdReader
 from websockets.sync.client import connect
 
-from app.web.door import Door, listen
+from app.web.http_server import HttpServer, listen
 from app.web.server import PageServer
 from estimators.errors import ConfigError
 from tests.app.scripted import pull_all, readings
@@ -25,7 +25,7 @@ STREAM = "/rerun/stream"
 
 @pytest.fixture(scope="module")
 def open_page(tmp_path_factory):
-    folder = tmp_path_factory.mktemp("door")
+    folder = tmp_path_factory.mktemp("page")
     with serving(folder) as serve:
         yield reviewing(serve, folder)
 
@@ -156,10 +156,10 @@ def test_the_end_of_an_answer_does_not_wait_for_the_acknowledgement_of_its_begin
 
 
 def test_it_listens_on_loopback_only(page):
-    assert {listener.getsockname()[0] for listener in page.server.door.sockets} <= {"127.0.0.1", "::1"}
+    assert {listener.getsockname()[0] for listener in page.server.http_server.sockets} <= {"127.0.0.1", "::1"}
 
 
-# The stage, framed under the other name of this machine, where the browser sends no cookie
+# The scene, framed under the other name of this machine, where the browser sends no cookie
 
 
 def framed(page, path, given, *, upgrade=False, origin="http://localhost:{port}"):
@@ -169,21 +169,21 @@ def framed(page, path, given, *, upgrade=False, origin="http://localhost:{port}"
 
 
 def test_a_pass_opens_the_stage_without_a_cookie(page):
-    given = page.server.door.stage_pass
+    given = page.server.http_server.scene_pass
     assert framed(page, "/viser/", given).status == 200
     here = f"localhost:{page.client.port}"
     with connect(
         f"ws://{here}/viser/?pass={given}&theme=light", origin=f"http://{here}", subprotocols=["viser-test"], proxy=None
-    ) as stage:
-        stage.send("text")
-        assert stage.recv(timeout=LIMIT_S) == "text"
+    ) as scene:
+        scene.send("text")
+        assert scene.recv(timeout=LIMIT_S) == "text"
     assert page.viser.requests and not any(given in str(request) for request in page.viser.requests)
 
 
 @pytest.mark.parametrize("path", ["/", "/api/status", "/api/model", "/viser/assets", "/page/page.js", STREAM])
 @pytest.mark.parametrize("upgrade", [False, True])
 def test_a_pass_opens_nothing_else(page, path, upgrade):
-    refused(framed(page, path, page.server.door.stage_pass, upgrade=upgrade))
+    refused(framed(page, path, page.server.http_server.scene_pass, upgrade=upgrade))
 
 
 @pytest.mark.parametrize("given", [None, "", "x", "é", "{cookie}", "{token}x"])
@@ -195,18 +195,18 @@ def test_without_its_pass_the_stage_is_closed(page, given, upgrade):
 
 @pytest.mark.parametrize("origin", ["http://evil.example", "http://127.0.0.1:{port}", "null"])
 def test_a_pass_does_not_let_another_site_connect(page, origin):
-    refused(framed(page, "/viser/", page.server.door.stage_pass, upgrade=True, origin=origin))
+    refused(framed(page, "/viser/", page.server.http_server.scene_pass, upgrade=True, origin=origin))
 
 
 def test_where_localhost_may_be_another_program_the_stage_stays_here():
     with socket.create_server(("127.0.0.1", 0)) as probe:
         port = probe.getsockname()[1]
     with socket.create_server(("::1", port), family=socket.AF_INET6):
-        door = Door(port)
+        http_server = HttpServer(port)
     try:
-        assert door.stage_pass is None
+        assert http_server.scene_pass is None
     finally:
-        door.stop()
+        http_server.stop()
 
 
 # What is served
@@ -287,11 +287,11 @@ def test_viser_messages_pass_both_ways_and_no_secret_of_the_browser(page):
     with connect(
         f"ws://{client.host}/viser/?a=b", origin=client.origin, additional_headers=headers, subprotocols=["viser-test"],
         proxy=None,
-    ) as stage:  # fmt: skip
-        assert stage.subprotocol == "viser-test"
+    ) as scene:  # fmt: skip
+        assert scene.subprotocol == "viser-test"
         for message in ("text", b"bytes"):
-            stage.send(message)
-            assert stage.recv(timeout=LIMIT_S) == message
+            scene.send(message)
+            assert scene.recv(timeout=LIMIT_S) == message
     assert page.viser.requests == [("/?a=b", [SECRET])]
 
 

@@ -56,9 +56,9 @@ def test_the_scene_is_chosen_enlarged_and_opened_alone(visit, session):
 
     select = page.get_by_label("Scene: Show")
     select.select_option("belief")
-    wait_for(lambda: session.running.view.stage.choices.values()["show"] == "belief")
+    wait_for(lambda: session.running.view.renderer.choices.values()["show"] == "belief")
     page.get_by_label("Scene: x", exact=True).select_option("rate")
-    wait_for(lambda: session.running.view.stage.choices.values()["y"] == "temperature")
+    wait_for(lambda: session.running.view.renderer.choices.values()["y"] == "temperature")
     until(page, "document.querySelector('[aria-label=\"Scene: y\"]').value === 'temperature'")
 
     # Once more S: the scene is larger than the charts, and stays so over a reload.

@@ -1,4 +1,4 @@
-"""The stage: builds and draws the chosen scene, one at a time, and holds the choices about it."""
+"""Renderer of the chosen scene, one at a time, and the choices about it."""
 
 from __future__ import annotations
 
@@ -45,7 +45,7 @@ class Scene(Protocol):
         """Send the present positions; lines and point clouds only if `heavy`."""
 
 
-class Stage:
+class SceneRenderer:
     """Builds the chosen scene, again after another choice, and draws it."""
 
     def __init__(self, server: viser.ViserServer, engine: Running) -> None:

@@ -36,7 +36,7 @@ from uvicorn.protocols.http.h11_impl import H11Protocol
 from estimators.errors import ConfigError
 
 from ..engine.jobs import LoopThread
-from .gate import SESSION, USER, Gate, Grant, User, changes, with_security_headers
+from .access import SESSION, USER, AccessControl, Grant, User, changes, with_security_headers
 from .http import PARSED_BODY
 from .request_threads import REQUEST_THREADS
 
@@ -152,7 +152,7 @@ class Auditor(Protocol):
 
 
 class ShownApplication:
-    """An application behind the door; `boot` distinguishes it from those before."""
+    """An application of the server; `boot` distinguishes it from those before."""
 
     def __init__(self, application: ASGIApp, boot: str, audit: Auditor | None = None) -> None:
         self.application, self.boot, self.audit = application, boot, audit
@@ -191,7 +191,7 @@ class ShownApplication:
             self.disconnected.set()
 
 
-class Door:
+class HttpServer:
     """Serves its own routes, then the present application, in a thread."""
 
     def __init__(
@@ -230,18 +230,18 @@ class Door:
         self._loop: asyncio.AbstractEventLoop | None = None
         former = FormerSessions(port) if port else None  # a free port is another one next time
         known = former.digests() if former is not None else []
-        gate = Gate(
+        access = AccessControl(
             with_security_headers(self._enter, self.port, public), self.token, self.port, known, grants,
             addresses=host != LOOPBACK, public=public,
         )  # fmt: skip
         if former is not None:
-            former.keep([gate.digest, *known])
-        self.entered = gate.entered
+            former.keep([access.digest, *known])
+        self.entered = access.entered
         self.overview = overview
-        self.stage_pass = gate.stage_pass if localhost and overview is None else None
-        """Pass of the stage for a frame under `localhost`; None where that may be another program."""
+        self.scene_pass = access.scene_pass if localhost and overview is None else None
+        """Pass of the scene for a frame under `localhost`; None where that may be another program."""
         config = uvicorn.Config(
-            gate, log_config=None, log_level="critical", access_log=False,
+            access, log_config=None, log_level="critical", access_log=False,
             server_header=False, lifespan="off", ws_per_message_deflate=False, timeout_graceful_shutdown=1,
             http=BoundedProtocol, backlog=BACKLOG,
         )  # fmt: skip
@@ -282,7 +282,7 @@ class Door:
     def show(
         self, application: ASGIApp | None, boot: str | None = None, audit: Auditor | None = None
     ) -> threading.Event:
-        """Put another application behind the door, or none; from any thread. Its `audit` gets requests that change.
+        """Show another application, or none; from any thread. Its `audit` gets requests that change settings.
 
         Returns:
             An event that is set once the previous application has no connection left.

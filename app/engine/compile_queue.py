@@ -1,4 +1,4 @@
-"""The workshop compiles filters into the cache in processes of its own.
+"""Queue of filters that processes of their own compile into the cache.
 
 Numba compiles in one thread at a time and holds the interpreter meanwhile; beside the engine it would delay every
 measurement for half a minute. Requested filters come first, on several processors; all others that apply follow one
@@ -22,8 +22,8 @@ POLL_PERIOD_S = 0.2
 """Seconds between two looks for new requests."""
 
 
-class Workshop:
-    """Compiles the filters of one twin and the decoders of its source."""
+class CompileQueue:
+    """Queue of the filters of one twin and the decoders of its source, and the processes that compile them."""
 
     def __init__(
         self,
@@ -57,7 +57,7 @@ class Workshop:
         self.report: Callable[[str], None] = lambda text: None
         """Called with a line about a failure, in another thread."""
         self._wake = threading.Condition()
-        self._thread = LoopThread(self._run, "workshop")
+        self._thread = LoopThread(self._run, "compile queue")
 
     def start(self) -> None:
         """Begin; with nothing to compile there is no thread and no process."""
@@ -88,7 +88,7 @@ class Workshop:
             self._wake.notify()
 
     def wait(self, name: str) -> None:
-        """Wait until a filter or decoder is ready, or the workshop ends."""
+        """Wait until a filter or decoder is ready, or the queue ends."""
         ready = threading.Event()
         self.ask(name, lambda name: ready.set())
         ready.wait()

@@ -4,8 +4,8 @@ A web page anywhere can make the user's browser send requests to 127.0.0.1, and 
 there. So every request, WebSocket upgrades included, is refused before any work unless its Host is a loopback name, its
 Origin (if it has one) is this server, and it carries the token or the cookie that the token was exchanged for.
 
-The stage is framed under the other loopback name of this machine, so that the browser draws it in a process of its own.
-For the browser that is another site, to which it sends no cookie: a pass in the address opens the stage alone.
+The scene is framed under the other loopback name of this machine, so that the browser draws it in a process of its own.
+For the browser that is another site, to which it sends no cookie: a pass in the address opens the scene alone.
 """
 
 from __future__ import annotations
@@ -36,7 +36,7 @@ SITE = re.compile(r"(https?)://(?:[a-z0-9._-]+|\[[0-9a-f:]+\])(?::([1-9][0-9]{0,
 PORTS = {"http": 80, "https": 443}
 """Ports that browsers leave out."""
 
-STAGE = "/viser/"
+SCENE_PATH = "/viser/"
 
 NEEDS_TOKENS = "others can reach it; give --tokens FILE, which has a token for each user"
 """Rule of addresses other than this machine's."""
@@ -166,7 +166,7 @@ def needed_role(scope: Scope) -> str:
     path = path_of_twin(scope["path"])
     if path == READINGS and scope.get("method") == "POST":
         return FEED
-    if path.startswith(STAGE.rstrip("/")):
+    if path.startswith(SCENE_PATH.rstrip("/")):
         return TUNE  # the scene has controls
     if scope["type"] == "websocket" or scope["method"] in ("GET", "HEAD"):
         return VIEW
@@ -182,7 +182,7 @@ def changes(path: str) -> bool:
     return path not in QUESTIONS
 
 
-class Gate:
+class AccessControl:
     """Lets a request through to an application, or answers 403 with one line."""
 
     def __init__(
@@ -218,8 +218,8 @@ class Gate:
         self._cookie = f"nisus_{port}={self._derived(f'cookie {port}')}"
         self.digest = _digest(self._cookie)
         """Digest of the cookie, by which a later session recognises it."""
-        self.stage_pass = self._derived(f"stage {port}")
-        """Pass in the address of the stage, which the page frames."""
+        self.scene_pass = self._derived(f"stage {port}")
+        """Pass in the address of the scene, which the page frames."""
 
     def _derived(self, purpose: str) -> str:
         return hmac.new(self._token.encode(), purpose.encode(), hashlib.sha256).hexdigest()
@@ -257,7 +257,7 @@ class Gate:
         if not (LOOPBACK_HOST.fullmatch(host) or published or (self._addresses and _is_address(host))):
             return _refusal(REFUSED_HOST)
         shows_token = _equals(query.getlist("token"), self._token)
-        framed = scope["path"] == STAGE and _equals(query.getlist("pass"), self.stage_pass)
+        framed = scope["path"] == SCENE_PATH and _equals(query.getlist("pass"), self.scene_pass)
         exchange = shows_token and scope["type"] == "http" and scope["path"] == "/" and scope["method"] == "GET"
         # Browsers name the origin of every WebSocket, and the site of a request without one.
         same_site = (_single(headers, "sec-fetch-site") or "none") in ("none", "same-origin")
