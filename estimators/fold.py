@@ -170,7 +170,7 @@ class Fold:
             return self._rows.mean[row].copy()
         finally:
             log.kind[row], log.t[row] = event
-            now.put(kept)
+            now.copy_from(kept)
             for column, value in zip(self._rows, line, strict=True):
                 column[row : row + 1] = value
             self._asked = -1
@@ -294,7 +294,7 @@ class Fold:
 
     def go_on_with(self, story: Story) -> None:
         """Adopt the state at the end of a story."""
-        self._now.put(story.end, 3)
+        self._now.copy_from(story.end, 3)
         self._asked = -1
 
     def _run_events(self, start: int, stop: int, blanks: Sequence[Blank] = ()) -> int:
@@ -346,7 +346,7 @@ class Fold:
     def _restore(self, index: int) -> None:
         at = self.snapshots.last(self.log.first + index)
         self.snapshots.forget_after(at)
-        self._now.put(self.snapshots[at])
+        self._now.copy_from(self.snapshots[at])
         self.decisions = [decision for decision in self.decisions if decision.row < at]
         self.n = at - self.log.first
         self._asked = -1

@@ -74,7 +74,7 @@ class Snapshot(NamedTuple):
         parts[-1] = parts[-1].reshape(self.doubt.shape)
         return Snapshot(block[:1].view(np.int64), *parts), block.ctypes.data
 
-    def put(self, other: Snapshot, parts: int = 6) -> None:
+    def copy_from(self, other: Snapshot, parts: int = 6) -> None:
         """Copy the numbers of another snapshot into this one; its first three `parts` are nothing of the detectors."""
         for mine, its in zip(self[:parts], other[:parts], strict=True):
             mine[:] = its

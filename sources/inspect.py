@@ -196,7 +196,7 @@ def _logs(files: list[Path], databases: list[tuple[Path, BusName]]) -> Recording
         reader = frames_reader(path, None, MAX_FRAME_BYTES)
         try:
             while not reader.ended:
-                item = reader.take(1.0)
+                item = reader.get(1.0)
                 if isinstance(item, Raw):
                     for place, bus in enumerate(item.buses):
                         rows = np.flatnonzero(item.bus == place)
@@ -325,7 +325,7 @@ def _tables(files: list[Path], time: TimeColumn) -> RecordingContents:
         for rows in _rows(path, time, columns, faults, counted):
             times.append(rows.t[rows.known])
             values.append(rows.values[rows.known])
-            order.look(path.name, rows.line[rows.known], times[-1])
+            order.check(path.name, rows.line[rows.known], times[-1])
     undated = counted.pop(UNDATED)
     if not any(part.size for part in times):
         none = (
@@ -369,7 +369,7 @@ def _sparse(
     for path in files:
         for rows in _rows(path, time, columns, faults, {UNDATED: []}):
             times.append(rows.t)
-            order.look(path.name, rows.line, rows.t)
+            order.check(path.name, rows.line, rows.t)
             for k in np.flatnonzero(~rows.blank.all(axis=0)):
                 there = ~rows.blank[:, k]
                 cells[columns[k]].append((rows.t[there], rows.values[there, k]))

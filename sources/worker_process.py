@@ -61,7 +61,7 @@ class WorkerProcess:
                 pickle.dump(item, self._requests)
             self._requests.flush()
 
-    def ask(self, function: Callable[..., Iterator[Any]], *args: Any) -> None:
+    def submit(self, function: Callable[..., Iterator[Any]], *args: Any) -> None:
         """Run `function(*args)` after what was asked before; it must be importable by name."""
         # The folder comes first and by itself: a function may be from a folder that was added since.
         self._write((list(sys.path), os.getcwd()), (function, args))
@@ -268,14 +268,14 @@ class IsolatedReader:
         self._waited = 0.0
         self._computed: float | None = None
         self._worker: WorkerProcess | None = _hire()
-        self._worker.ask(_read, function, path, args)
+        self._worker.submit(_read, function, path, args)
 
     @property
     def ended(self) -> bool:
         """Whether the last item has been taken."""
         return self._worker is None
 
-    def take(self, timeout: float) -> Any:
+    def get(self, timeout: float) -> Any:
         """Return the next item, or None: at the end (`ended`), or if none came within `timeout` seconds.
 
         Raises:
@@ -351,13 +351,13 @@ def read_isolated(
     """Return all items of an `IsolatedReader`.
 
     Raises:
-        ReaderError: See `IsolatedReader.take`.
+        ReaderError: See `IsolatedReader.get`.
     """
     reader = IsolatedReader(function, path, *args, timeout=timeout)
     items = []
     try:
         while not reader.ended:
-            if (item := reader.take(1.0)) is not None:
+            if (item := reader.get(1.0)) is not None:
                 items.append(item)
     finally:
         reader.close()

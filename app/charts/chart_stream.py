@@ -82,7 +82,7 @@ class ChartStream:
         """Note that rows from this one on are new or have changed."""
         self._dirty = min(self._dirty, row)
 
-    def look(self, run: ChartedRun, origin: int, newest: int) -> None:
+    def select(self, run: ChartedRun, origin: int, newest: int) -> None:
         """Find the rows that the query covers, and the size of their groups; the run's levels need not be up to date.
 
         `origin` and `newest` are the times of the first event, from which seconds count, and of the last one, ns.
@@ -110,7 +110,7 @@ class ChartStream:
         sent_as = (run, run.generation, size, self._every_dot)
         end = min(stop, run.end)
         if end > self._end:
-            # Rows may have arrived after `look`.
+            # Rows may have arrived after `select`.
             self.mark_changed(self._end)
         first, last = start // size, -(-end // size)
         have_first, have_last = self._sent

@@ -108,7 +108,7 @@ class Pyramid:
                     break
                 self._levels.append(_Level(FIRST * FACTOR**k, self._columns))
                 fresh = coarser(self._levels[k - 1].groups)
-            self._levels[k].put(fresh)
+            self._levels[k].replace_from(fresh)
             if not fresh.n:
                 break
             groups = self._levels[k].groups
@@ -146,7 +146,7 @@ class _Level:
         first, last, low, high, rising = (column[: self._n] for column in self._room)
         return Groups(self._size, self._start, first, last, low, high, rising)
 
-    def put(self, fresh: Groups) -> None:
+    def replace_from(self, fresh: Groups) -> None:
         """Put groups in place of those from their number on."""
         at = fresh.start - self._start
         if not 0 <= at <= self._n:

@@ -66,7 +66,7 @@ class Series:
             runs = {name: self._find(name) for name in dict.fromkeys(stream.query.run for stream in asked)}
             shown = [(stream, run) for stream in asked if (run := runs[stream.query.run]) is not None]
             for stream, run in shown:
-                stream.look(run, origin, newest)
+                stream.select(run, origin, newest)
             for name, run in runs.items():
                 if run is not None:
                     viewers = [stream for stream in self.streams if stream.query.run == name]

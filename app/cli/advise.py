@@ -25,7 +25,7 @@ from ..study.advice.verdict import Advice, advice_json, changed, details, exclus
 from ..study.advice.verdict import advise as recommend
 from ..twin.log_reader import read_log
 from ..twin.twin import Twin, load_twin
-from .log import databases_of, look
+from .log import contents_of, databases_of
 from .new import fit_draft, report_draft, roles_json
 from .options import check_output, overrides_of, roles_of
 from .prepare import attend, prepare
@@ -112,7 +112,7 @@ def _topics(twin: Twin, log: Log, advice: Advice) -> list[Topic]:
 
 def _draft(arguments: Arguments, files: tuple[Path, ...]) -> int:
     """Draft a twin from recordings."""
-    found = look(files, arguments)
+    found = contents_of(files, arguments)
     drafted, every = plan(found, roles_of(arguments)), signals(found)
     if arguments.out is not None:
         if arguments.out.suffix not in (".yaml", ".yml", ""):

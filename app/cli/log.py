@@ -54,7 +54,7 @@ TIMES = (
 
 def show_log(arguments: Arguments) -> int:
     """Print what a recording holds."""
-    found = look(arguments.files, arguments)
+    found = contents_of(arguments.files, arguments)
     if arguments.json:
         print(to_json(_as_dict(found)))
         return 0
@@ -66,7 +66,7 @@ def show_log(arguments: Arguments) -> int:
     return 0
 
 
-def look(files: tuple[Path, ...], options: TableOptions) -> RecordingContents:
+def contents_of(files: tuple[Path, ...], options: TableOptions) -> RecordingContents:
     """Return the content of recordings, CAN logs or tables.
 
     Raises:

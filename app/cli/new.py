@@ -111,10 +111,10 @@ def new_twin(arguments: Arguments) -> int:
     if arguments.log:
         from ..study.advice.draft import check_new, write_draft
         from ..study.advice.plan import plan
-        from .log import databases_of, look
+        from .log import contents_of, databases_of
 
         check_new(arguments.name, arguments.folder)
-        found = look(arguments.log, arguments)
+        found = contents_of(arguments.log, arguments)
         drafted = fit_draft(plan(found, roles_of(arguments)))
         written = write_draft(drafted, found, arguments.name, arguments.folder, databases_of(arguments))
         report_draft(written, arguments.json)

@@ -111,7 +111,7 @@ def begin_to_compile(twin: Twin, workers: Sequence[Compiler] = ()) -> CompileQue
     filters = [name for name, entry in ESTIMATORS.items() if unfit(entry, twin.model) is None]
     compile_queue = CompileQueue([*twin.kernels, *filters], workers=workers)
     for name in (*twin.kernels, twin.estimator):
-        compile_queue.ask(name)
+        compile_queue.request(name)
     compile_queue.start()
     return compile_queue
 
@@ -167,7 +167,7 @@ def _watch(over: Future[Any], watch: CallWatch | None, text: Callable[[], str], 
     console = _console()
     with _shown(text, console, first):
         while wait([over], 0.5).not_done:
-            line = None if watch is None else watch.look()
+            line = None if watch is None else watch.check()
             if line is not None:
                 console.print(line, highlight=False, soft_wrap=True)
 

@@ -168,13 +168,13 @@ class Smoother:
         self._smoothed: tuple[int, int, int] | None = None
         self._refused = ""
         self._compiled = False
-        self.job = engine.jobs.run("smoother", self.look, every=PERIOD_S, failed=self._refuse)
+        self.job = engine.jobs.run("smoother", self.update, every=PERIOD_S, failed=self._refuse)
 
     def stop(self) -> None:
         """End after the fold that is under way; no client shows the smoothed estimate."""
         self.job.cancel()
 
-    def look(self, job: Job) -> float:
+    def update(self, job: Job) -> float:
         """Smooth, if there are new events; return the seconds until the next look."""
         if not self._compiled:
             _compile(job)

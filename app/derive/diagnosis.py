@@ -101,7 +101,7 @@ class Diagnosis:
         self._engine, self._figures = engine, FoldFigureCache(engine)
         self._known: tuple[float, dict[str, Any]] | None = None
 
-    def look(self) -> dict[str, Any]:
+    def figures(self) -> dict[str, Any]:
         """Return the figures of the last rows, at most `REUSE_S` seconds old.
 
         `rows` are the first of the sensors' rows (row_figures.py), `rows_in_all` how many there are, `ranks` counts of

@@ -79,7 +79,7 @@ class Forecasts:
             raise ConfigError("forecast: no reading has come yet, so there is no estimate to go on from")
         return here
 
-    def ask(self, question: ForecastQuestion) -> dict[str, Any]:
+    def compute(self, question: ForecastQuestion) -> dict[str, Any]:
         """Return the forecast, see `forecast_json`.
 
         Raises:

@@ -228,7 +228,7 @@ class Refits:
 
     def start(self) -> None:
         """Begin to look at the log's clock."""
-        self._engine.jobs.run("refit", lambda job: self.look(), every=CLOCK_PERIOD_S)
+        self._engine.jobs.run("refit", lambda job: self.update(), every=CLOCK_PERIOD_S)
 
     def now(self) -> None:
         """Fit at once.
@@ -281,7 +281,7 @@ class Refits:
 
     # In its job
 
-    def look(self) -> None:
+    def update(self) -> None:
         """Take the result of a finished fit, and begin one that is due."""
         with self._lock:
             last = self.known[-1] if self.known else None

@@ -82,7 +82,7 @@ class Requests:
         """Whether the newest has no answer yet."""
         return self._answered != self.newest
 
-    def ask(self) -> int:
+    def add(self) -> int:
         """Add a request over the log as it is now; return its ticket."""
         self.newest += 1
         self._open[self.newest] = None
@@ -96,7 +96,7 @@ class Requests:
         """Go on with a request over the log as it is now."""
         self._open[ticket] = None
 
-    def look(self, ticket: int) -> tuple[bool, int | None]:
+    def state(self, ticket: int) -> tuple[bool, int | None]:
         """Return whether the log of a request is still the present one, and from where on that has changed."""
         return ticket in self._open, self._open.get(ticket)
 

@@ -50,7 +50,7 @@ class CompileQueue:
             left = [piece for piece in pieces(name) if not is_done(piece)]
             if left:
                 self._left[name] = left
-        self._asked: dict[str, float] = {}
+        self._requested: dict[str, float] = {}
         self._waiting: list[tuple[str, Callable[[str], None]]] = []
         self._under_way: dict[Compiler, Piece] = {}
         self._lost: list[Piece] = []
@@ -78,11 +78,11 @@ class CompileQueue:
         """Return whether a filter or decoder is in the cache."""
         return not any(part in self._left for part in needs(name))
 
-    def ask(self, name: str, done: Callable[[str], None] = lambda name: None) -> None:
+    def request(self, name: str, done: Callable[[str], None] = lambda name: None) -> None:
         """Compile a filter or decoder before any other; `done` is called with its name, in another thread."""
         with self._wake:
             if not self.ready(name):
-                self._asked.setdefault(name, time.monotonic())
+                self._requested.setdefault(name, time.monotonic())
             self._waiting.append((name, done))
             self._tell()
             self._wake.notify()
@@ -90,7 +90,7 @@ class CompileQueue:
     def wait(self, name: str) -> None:
         """Wait until a filter or decoder is ready, or the queue ends."""
         ready = threading.Event()
-        self.ask(name, lambda name: ready.set())
+        self.request(name, lambda name: ready.set())
         ready.wait()
 
     def states(self) -> dict[str, float | None]:
@@ -103,7 +103,7 @@ class CompileQueue:
                           default=None)
                 for name in left
             }  # fmt: skip
-            return begun | {name: now - since for name, since in self._asked.items() if name not in KERNELS}
+            return begun | {name: now - since for name, since in self._requested.items() if name not in KERNELS}
 
     def _run(self) -> None:
         hurried = self._workers
@@ -117,7 +117,7 @@ class CompileQueue:
                         return
                     hurried = [worker for worker in hurried if not worker.ended]
                     quiet = None if quiet is not None and quiet.ended else quiet
-                    wanted = list(dict.fromkeys(part for name in self._asked for part in needs(name)))
+                    wanted = list(dict.fromkeys(part for name in self._requested for part in needs(name)))
                     while (piece := self._next(wanted)) is not None:
                         worker = next((each for each in hurried if each not in self._under_way), None)
                         if worker is None:
@@ -186,5 +186,5 @@ class CompileQueue:
     def _tell(self) -> None:
         for name, done in [item for item in self._waiting if self.ready(item[0])]:
             self._waiting.remove((name, done))
-            self._asked.pop(name, None)
+            self._requested.pop(name, None)
             done(name)

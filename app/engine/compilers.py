@@ -36,7 +36,7 @@ class Compiler:
     def __init__(self, work: Callable[[Piece], None] | None, niceness: int) -> None:
         """Start it; `work` None is `make` of `sources/pieces.py`, imported there alone."""
         self._process = WorkerProcess()
-        self._process.ask(_set_up, niceness)
+        self._process.submit(_set_up, niceness)
         self._work, self._left = work, 1
         self.connection = self._process.answers
         self.begun = 0.0
@@ -47,7 +47,7 @@ class Compiler:
         """Begin a piece."""
         self.begun = time.monotonic()
         self._left += 1
-        self._process.ask(_compile, self._work, piece)
+        self._process.submit(_compile, self._work, piece)
 
     def answered(self) -> bool:
         """Return whether the piece is done, or the process has ended, if necessary after a timeout."""

@@ -414,7 +414,7 @@ class Engine(Running):
     def _take(self, batch: Events, horizon: int | None = None, settled: np.ndarray | None = None) -> int:
         """Put events into the log and fold the first of them; return how many were stale."""
         before, stale = self._extend(batch, horizon, settled)
-        self._watchers.alerts.look(self._fold, before)
+        self._watchers.alerts.report(self._fold, before)
         return stale
 
     def _fold_on(self) -> None:
@@ -423,7 +423,7 @@ class Engine(Running):
             with self._moving():
                 before = self._fold.n
                 self._batches.advance(self._fold)
-                self._watchers.alerts.look(self._fold, before)
+                self._watchers.alerts.report(self._fold, before)
             if self._submitted:
                 return
         self._idle_ticks.folded()
@@ -441,7 +441,7 @@ class Engine(Running):
         if self._finished:
             return
         if not self._log.n:
-            self._watchers.silence.look(live=self._feeder.live)
+            self._watchers.silence.check(live=self._feeder.live)
             return
         now = self._idle_ticks.asks(self._feeder.source, int(self._log.t[self._log.n - 1]))
         if now is not None:
@@ -449,8 +449,8 @@ class Engine(Running):
 
     def _watch(self) -> None:
         while not self._watching.stopping.wait(WATCH_PERIOD_S):
-            self._watchdog.look()
-            self._refold_watchdog.look()
+            self._watchdog.check()
+            self._refold_watchdog.check()
 
     def _report_stalled(self, text: str, level: str) -> None:
         self.notices.say(text, level=level)
@@ -520,13 +520,13 @@ class Engine(Running):
             # Of a revision before the twin's files were saved.
             tuning = replace(tuning, model=self.model)
         # First, so that nobody sees the new tuning without a refold that is waited for.
-        ticket = self._requests.ask()
+        ticket = self._requests.add()
         with self._lock:
             self.estimator, self.tuning, self._gesture = estimator, tuning, gesture
         self._awaited = None if self._compile_queue.ready(estimator) else estimator
         self._status = (-np.inf, self._status[1])
         if self._awaited is not None:
-            self._compile_queue.ask(estimator, lambda name: self._inbox.put(partial(self._compiled, name)))
+            self._compile_queue.request(estimator, lambda name: self._inbox.put(partial(self._compiled, name)))
             return
         log, base = self._log.copy(), self._base
         self._ask_refold(ticket, lambda: self._make_fold(estimator, tuning, log, base), gesture)
@@ -578,7 +578,7 @@ class Engine(Running):
         If that takes long or a command waits, the refold continues as a job; `row_counts` are of the rows that it has
         lost, and `left` is the number of events that it was behind then. One that falls behind even so ends here.
         """
-        wanted, changed_from = self._requests.look(ticket)
+        wanted, changed_from = self._requests.state(ticket)
         again = False
         if wanted and fold is not None:
             try:
@@ -600,7 +600,7 @@ class Engine(Running):
                 if self._finished:
                     fold.finish()
                 self._watchers.alerts.again()
-                self._watchers.alerts.look(fold, fold.n)
+                self._watchers.alerts.report(fold, fold.n)
             elif wanted and not again:
                 self.notices.say(f"not folded again: {error}", level="error")
                 if ticket == self._requests.newest:

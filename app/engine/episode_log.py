@@ -132,7 +132,7 @@ class EpisodeLog:
             self._engine.notices.report("episodes", f"{type(error).__name__}: {error}", level="error")
         self._engine.release(self._cursor)
 
-    def look(self, job: Job) -> float:
+    def update_in_job(self, job: Job) -> float:
         """Update, in a repeated job; return the seconds to the next update."""
         begun = time.monotonic()
         self.update()

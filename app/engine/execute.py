@@ -101,7 +101,7 @@ def prepared(command: commands.Command, engine: Running) -> Callable[[], Any]:
                 raise ConfigError("Annotate: no measurement has arrived yet; wait for the first")
             engine.annotations.check(text, at, number, span_of(engine.source) or (first, now))
             t = None if at is None else round(at * 1e9)
-            return partial(engine.annotations.put, text, t, number, now)
+            return partial(engine.annotations.add_or_change, text, t, number, now)
         case commands.DeleteAnnotation(number):
             engine.annotations.find(number)
             return partial(engine.annotations.delete, number)

@@ -51,7 +51,7 @@ class Alerts:
         self._decided = max([self._decided, *(decision.time for decision in fold.decisions)])
         self._lost, self._examine_all = self._first_lost_row(fold, 0), False
 
-    def look(self, fold: Fold, before: int) -> None:
+    def report(self, fold: Fold, before: int) -> None:
         """Report the rows from `before` on."""
         say, report = self._notices.say, self._notices.report
         known = {f"gated {name}" for name in self._in_alarm()}

@@ -151,7 +151,7 @@ class ProtectionMonitor:
         latest = self._latest
         return latest if latest is not None and latest.revision == revision else None
 
-    def look(self, job: Job) -> None:
+    def update(self, job: Job) -> None:
         """Compute the levels, unless they are recent enough or no event has come."""
         taken = self._take()
         if taken is None:

@@ -223,7 +223,7 @@ class Annotations:
                 "/api/episodes)"
             )
 
-    def put(self, text: str, t: int | None, number: int | None, now: int) -> None:
+    def add_or_change(self, text: str, t: int | None, number: int | None, now: int) -> None:
         """Add a note at `t` (ns), by default `now`, or change the one of that number, which by default stays there."""
         if number is None:
             number, t = self._next, now if t is None else t

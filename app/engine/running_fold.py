@@ -70,7 +70,7 @@ class Published(Protocol):
 class StateWriter(Protocol):
     """Writer of the store of a running twin."""
 
-    def ask(self) -> None:
+    def request_write(self) -> None:
         """Write soon."""
 
     def has(self, mark: int) -> bool | None:

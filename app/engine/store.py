@@ -473,7 +473,7 @@ class StoreWriter:
         """Begin to write."""
         self._jobs.start()
 
-    def ask(self) -> None:
+    def request_write(self) -> None:
         """See `StateWriter`."""
         self._asked.set()
 
@@ -486,9 +486,9 @@ class StoreWriter:
         self._asked.wait(self._pause)
         job.check()
         self._asked.clear()
-        self._pause = self.look()
+        self._pause = self.write()
 
-    def look(self, *, closed: bool = False) -> float:
+    def write(self, *, closed: bool = False) -> float:
         """Write what has changed; return the seconds to the next time."""
         begun = time.monotonic()
         try:
@@ -555,7 +555,7 @@ class StoreWriter:
         """Write the rest of an engine that has stopped, and close the store."""
         self._asked.set()
         self._jobs.stop()
-        self.look(closed=True)
+        self.write(closed=True)
         self._engine.release(self._cursor)
         self._store.close()
 

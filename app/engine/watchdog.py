@@ -57,7 +57,7 @@ class CallWatch:
         self._clock = clock
         self._seen: tuple[Any, float] | None = None
 
-    def look(self) -> str | None:
+    def check(self) -> str | None:
         """Return a line once a call has taken `CALL_TIMEOUT_S`; None otherwise."""
         frame = self._call()
         if frame is None:
@@ -134,7 +134,7 @@ class Watchdog:
         finally:
             self._work = None
 
-    def look(self) -> None:
+    def check(self) -> None:
         """Look once at the duration of the present fold."""
         work = self._work
         if work is None or work is not self._asked:
@@ -170,7 +170,7 @@ def interruptible(fold: Fold, work: Callable[[], Any]) -> None:
     over = start_in_thread(run, "fold")
     while not over.done():
         wait([over], 0.5)
-        watchdog.look()
+        watchdog.check()
     over.result()
 
 
@@ -187,7 +187,7 @@ def unanswered(questions: Iterable[tuple[str, Callable[[], Any]]], timeout: floa
     asking: list[str] = []
     over = threading.Event()
 
-    def ask() -> None:
+    def call_all() -> None:
         try:
             for what, question in questions:
                 asking.append(what)
@@ -195,7 +195,7 @@ def unanswered(questions: Iterable[tuple[str, Callable[[], Any]]], timeout: floa
         finally:
             over.set()
 
-    threading.Thread(target=ask, name="asking", daemon=True).start()
+    threading.Thread(target=call_all, name="asking", daemon=True).start()
     known = -1
     while not over.wait(ANSWER_TIMEOUT_S if timeout is None else timeout):
         if asking and len(asking) == known:

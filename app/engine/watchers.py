@@ -49,10 +49,10 @@ class Watchers:
 
     def start(self) -> None:
         """Begin to monitor."""
-        self._monitors.run("episodes", self.episode_log.look, every=EPISODES_PERIOD_S)
-        self._jobs.run("protection levels", self.integrity.look, every=LEVELS_PERIOD_S)
+        self._monitors.run("episodes", self.episode_log.update_in_job, every=EPISODES_PERIOD_S)
+        self._jobs.run("protection levels", self.integrity.update, every=LEVELS_PERIOD_S)
         self._jobs.run("root cause", self.root_cause.update, every=ROOT_CAUSE_PERIOD_S)
-        self._monitors.run("repeated values", self.repeats.look, every=REPEATS_PERIOD_S)
+        self._monitors.run("repeated values", self.repeats.check, every=REPEATS_PERIOD_S)
 
     def arrived(self, batch: Events, passed: Events) -> None:
         """Note a batch of a live source that was folded, and those of its events that passed."""
@@ -245,7 +245,7 @@ class RepeatedValues:
         self._since = Counter[str]()
         """Searches of each row since repeats were found in it."""
 
-    def look(self, job: Job) -> float:
+    def check(self, job: Job) -> float:
         """Search the last values of each sensor row; return the seconds to the next time."""
         if not self._engine.source.live:
             return math.inf
@@ -311,7 +311,7 @@ class SilentSource:
             return ""
         return f"nothing has come since the twin started, {self._clock() - self._since:.0f} s ago; check the source"
 
-    def look(self, *, live: bool) -> None:
+    def check(self, *, live: bool) -> None:
         """Report a live source without events, once it is stale; a recording may be paused."""
         if live and not self._reported and self._clock() - self._since > self._after:
             self._reported = True

@@ -103,7 +103,7 @@ def _frame(tuning: Tuning, events: Events, track: Track, kinds: tuple[str, ...] 
     )
     run, origin = ChartedRun(KeptRows(pull), columns), int(events.t[0])
     stream = ChartStream("report", ChartQuery(names, points=MAX_GROUPS), columns)
-    stream.look(run, origin, int(events.t[-1]))
+    stream.select(run, origin, int(events.t[-1]))
     run.sync(stream.levelled)
     return base64.b64encode(stream.frame(run, origin) or b"").decode()
 

@@ -55,10 +55,10 @@ def encoded(kind: str, parts: Iterable[Any]) -> Iterator[bytes]:
             make = pyarrow.csv.CSVWriter if kind == "csv" else pyarrow.parquet.ParquetWriter
             writer = make(sink, table.schema)
         writer.write_table(table)
-        yield sink.take()
+        yield sink.drain()
     if writer is not None:
         writer.close()
-        yield sink.take()
+        yield sink.drain()
 
 
 class _Sink(io.BytesIO):
@@ -72,7 +72,7 @@ class _Sink(io.BytesIO):
     def close(self) -> None:
         """Stay open: the last bytes are taken after the end of the file."""
 
-    def take(self) -> bytes:
+    def drain(self) -> bytes:
         """Return the bytes written since the last call."""
         data = self.getvalue()
         self._taken += len(data)

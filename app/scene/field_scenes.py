@@ -68,7 +68,7 @@ class FieldView:
             self._kind = self._kinds[title]
             self._drawn, self._dirty = -np.inf, True
 
-    def take(self, pull: Pull) -> None:
+    def update(self, pull: Pull) -> None:
         """Keep the latest picture of each kind of a pull."""
         for kind in self._kinds.values():
             images = (image_of(picture, kind) for picture in reversed(pull.pictures))
@@ -128,9 +128,9 @@ class FieldScene(FieldView):
         y = (0.5 - share[:, 1]) * self._size[1]
         return np.column_stack((x, y, np.full(len(pixels), height))).astype(np.float32)
 
-    def take(self, pull: Pull) -> None:
+    def update(self, pull: Pull) -> None:
         """Keep the latest pictures of a pull, and the latest innovation of each sensor."""
-        super().take(pull)
+        super().update(pull)
         self._dirty |= take_innovations(self._normalised, self._which, pull.events, pull.track)
 
     def draw(self, history: History, belief: Belief | None, heavy: bool = True) -> None:

@@ -184,7 +184,7 @@ class Choices:
         """Time that the scene shows, ns; None is the newest row."""
         return self._at[1]
 
-    def look(self, page: object, at: int | None) -> None:
+    def show(self, page: object, at: int | None) -> None:
         """Show a time, ns, for a page; None is the newest row."""
         self._at = page, at
 

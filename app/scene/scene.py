@@ -213,7 +213,7 @@ class History:
         """Drop all rows."""
         self.base, self.n = 0, 0
 
-    def take(self, pull: Pull) -> int:
+    def update(self, pull: Pull) -> int:
         """Write a pull of at most `limit` rows into the arrays; return the first changed row: all after it did too."""
         count = len(pull.events)
         if pull.fresh or not self.n or not self.base <= pull.first <= self.base + self.n:

@@ -159,7 +159,7 @@ class VehicleScene:
         several = belief.peaks if known and len(belief.peaks) > 1 else ()
         peak = several[0] if several else belief
         self._draw_peaks(several)
-        self._way.look(t, plane, several[0].mean[self._plane] if several else None)
+        self._way.update(t, plane, several[0].mean[self._plane] if several else None)
         if heavy:
             way = self._way.of(t, where_known(plane, history.column("std")[:, self._plane]))
             self._trail.points = segments(without_jumps(_line(way, 0.06)))
@@ -289,7 +289,7 @@ class PeakTrail:
     def __init__(self) -> None:
         self._looks: list[tuple[int, np.ndarray, np.ndarray]] = []
 
-    def look(self, t: np.ndarray, mean: np.ndarray, peak: np.ndarray | None) -> None:
+    def update(self, t: np.ndarray, mean: np.ndarray, peak: np.ndarray | None) -> None:
         """Keep the frame of the newest row.
 
         `t` has times of the rows, ns, (n,), `mean` the position by the mean of each, (n, 2). `peak` is that of the

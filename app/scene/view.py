@@ -113,8 +113,8 @@ class ViserView:
 
     def _take(self, pull: Any) -> None:
         if isinstance(self.renderer.scene, FIELD_SCENES):
-            self.renderer.scene.take(pull)
-        self.history.take(replace(pull, track=shown_track(self.engine.model, pull.track)))
+            self.renderer.scene.update(pull)
+        self.history.update(replace(pull, track=shown_track(self.engine.model, pull.track)))
         self.history.trim()
 
     def _waits(self, now: float) -> bool:

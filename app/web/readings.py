@@ -146,7 +146,7 @@ async def stored(engine: Recipient, mark: int) -> bool:
     while store is not None and (found := store.has(mark)) is not None:
         if found or time.monotonic() > end:
             return found
-        store.ask()
+        store.request_write()
         await asyncio.sleep(POLL_S)
     return False
 

@@ -173,7 +173,7 @@ class PageServer:
             post("/api/command", self._command, status=202, body_schema=commands_schema),
             get("/api/forecast", self._forecasts.may, refused=409),
             post("/api/forecast", self._forecast, run=OneAtATime("forecast")),
-            get("/api/diagnose", self._diagnosis.look, refused=503, run=OneAtATime("diagnosis")),
+            get("/api/diagnose", self._diagnosis.figures, refused=503, run=OneAtATime("diagnosis")),
             get("/api/scene", self._scene),
             post("/api/scene", self._choose),
             get("/api/recordings", self._list_recordings),
@@ -277,7 +277,7 @@ class PageServer:
 
     def _forecast(self, body: Any) -> Any:
         """Forecast from the present estimate."""
-        return self._forecasts.ask(question_from_json(body, self._engine.model))
+        return self._forecasts.compute(question_from_json(body, self._engine.model))
 
     def _scene(self) -> Any:
         """Return the options of the scene."""

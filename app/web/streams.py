@@ -153,7 +153,7 @@ class PageStream:
         if "at" in message and (origin := self._series.origin()) is not None:
             self._at = None if wanted.at is None else origin + round(wanted.at * 1e9) + EQUAL_NS
             if self._choices is not None:
-                self._choices.look(self, self._at)
+                self._choices.show(self, self._at)
             self._pointed.set()
         if not wanted.streams:
             return

@@ -40,7 +40,7 @@ class AssetFold:
 
     def go_on_with(self, story: Story) -> None:
         """See `Fold.go_on_with`."""
-        self._now.put(story.end, 3)
+        self._now.copy_from(story.end, 3)
 
 
 class _Sizes(NamedTuple):

@@ -49,7 +49,7 @@ from .memory import (
     state_at,
 )
 from .order import precedes
-from .record import append, before_snapshot, cut, free_records, slot_of, snapshots_of, take
+from .record import allocate, append, before_snapshot, cut, free_records, slot_of, snapshots_of
 from .window import has_no_baseline, return_to, slide
 
 _PLAN = """
@@ -346,7 +346,7 @@ def _fold_share(place, crew):
             head[N] = n + 1
             if asks:
                 if record_place == 0:
-                    record_place = take(asset, block, oldest, recent, records, free, slots, rows)
+                    record_place = allocate(asset, block, oldest, recent, records, free, slots, rows)
                     record = record_at(record_place, plan.size, slots, ring, rows, columns)
                 _stop(record, n + 1, oldest, a, tail, tail_t, tail_place, tail_value)
                 asked[v] |= ASKED_FLAG

@@ -65,7 +65,7 @@ def append(record, n, t, place, value):
 
 
 @part
-def take(asset, block, oldest, recent, records, free, slots, rows):
+def allocate(asset, block, oldest, recent, records, free, slots, rows):
     """Give an asset a free record, with its events since the oldest snapshot of its block; return its address."""
     place = free[free[0]]
     free[0] -= 1
@@ -117,7 +117,7 @@ def before_snapshot(
     n, place = head[N], records[asset]
     needed = _rejects(block.snapshots[slot_of(head, newer, recent)], nu, size, evidence, edge, sensors)
     if place == 0:
-        return take(asset, block, oldest, recent, records, free, slots, rows) if needed else place
+        return allocate(asset, block, oldest, recent, records, free, slots, rows) if needed else place
     record = record_at(place, block.now.size, slots, block.t.size, rows, block.value.shape[1])
     own = record.head
     if not needed and newer >= max(own[PINNED], own[ASKED]) and own[REWOUND] < 0 and free[0] < MAX_FREE:

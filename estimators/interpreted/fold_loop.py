@@ -189,6 +189,6 @@ def run_and_judge(judge: Any, context: Any, code: Any, place: int, *given: Any) 
         if asking >= 0:
             return asking
         if k < len(kept):
-            kept[k].put(Snapshot(clock, u, state, evidence, edge, doubt))
+            kept[k].copy_from(Snapshot(clock, u, state, evidence, edge, doubt))
         start = end
     return -1

@@ -104,26 +104,26 @@ def declare_layout(
 # `own.mean[i] = ...`, for dead.
 @overload(take_matrix)
 def _take_matrix(at, rows, columns):
-    def take(at, rows, columns):
+    def impl(at, rows, columns):
         return carray(_to_float(at), (rows, columns)), at + WORD * rows * columns
 
-    return take
+    return impl
 
 
 @overload(take_vector)
 def _take_vector(at, n):
-    def take(at, n):
+    def impl(at, n):
         return carray(_to_float(at), (n,)), at + WORD * n
 
-    return take
+    return impl
 
 
 @overload(take_integers)
 def _take_integers(at, n):
-    def take(at, n):
+    def impl(at, n):
         return carray(_to_int(at), (n,)), at + WORD * n
 
-    return take
+    return impl
 
 
 @intrinsic

@@ -27,7 +27,7 @@ from .proposals import (
     PROPOSE,
     WAITING,
     expect_block,
-    look,
+    innovation_log_density,
     move_block,
     place_draw,
     predict,
@@ -58,7 +58,7 @@ def propose_block(context, u, dt, sensor, y, key, value, state, work, number):
     sums[2] = -np.inf
     for i in range(first, last):
         x, P = records[i, :nx], own_covariance(records[i], nx)
-        density = look(context, sensor, u, y, x, P, L, H, HL, S, U, e, seen, scratch)
+        density = innovation_log_density(context, sensor, u, y, x, P, L, H, HL, S, U, e, seen, scratch)
         # Where h or its slope is NaN there is no proposal: the particle stays and gets weight zero.
         sound = -np.inf < density < np.inf
         posterior(m, HL, U, seen, z, P)
@@ -84,7 +84,7 @@ def propose_block(context, u, dt, sensor, y, key, value, state, work, number):
 
 @inlined
 def posterior(m, HL, U, seen, z, P):
-    """Fill z = ẑ and the lower triangle of P = Σ from the results of `look` for m rows; H L becomes U⁻ᵀ H L."""
+    """Fill z = ẑ and the lower triangle of P = Σ from the results of `innovation_log_density`; H L becomes U⁻ᵀ H L."""
     nx = z.size
     for k in range(m):
         for j in range(nx):

@@ -130,7 +130,7 @@ def move_block(context, u, dt, sensor, y, key, value, state, work, number):
 
 
 @jit
-def look(context, sensor, u, y, x, P, L, H, HL, S, U, e, expected, scratch):
+def innovation_log_density(context, sensor, u, y, x, P, L, H, HL, S, U, e, expected, scratch):
     """Residual e, L, H L and S = H P Hᵀ + R = Uᵀ U of one particle, over the finite rows; `expected` gets U⁻ᵀ e.
 
     Returns:
@@ -196,7 +196,7 @@ def expect_block(context, u, dt, sensor, y, key, value, state, work, number):
     for i in range(first, last):
         x = records[i, :nx]
         P = own_covariance(records[i], nx)
-        density = look(context, sensor, u, y, x, P, L, H, HL, S, U, e, seen, scratch)
+        density = innovation_log_density(context, sensor, u, y, x, P, L, H, HL, S, U, e, seen, scratch)
         sound = density < np.inf and log_w[i] > -np.inf
         if own:
             density = own_likelihood(context, sensor, y, x, u)

@@ -185,7 +185,7 @@ class MomentsBack:
         """See `Notes`."""
         self._recorder = StepRecorder(self._machine.code, self._kind, self._own, self._nx, self._members, events)
 
-    def take(self, part: Stretch, now: Snapshot, row: int) -> np.ndarray:
+    def forward(self, part: Stretch, now: Snapshot, row: int) -> np.ndarray:
         """See `Notes`."""
         self._recorder.begin(row)
         noting = now._replace(state=self._recorder.around(now.state))

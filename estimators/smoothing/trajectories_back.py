@@ -86,7 +86,7 @@ class TrajectoriesBack:
         """See `Notes`."""
         self._states = np.empty((events, self.each // 8))
 
-    def take(self, part: Stretch, now: Snapshot, row: int) -> np.ndarray:
+    def forward(self, part: Stretch, now: Snapshot, row: int) -> np.ndarray:
         """See `Notes`."""
         spare = now.state.copy()
         for i in range(part.start, part.stop):

@@ -58,7 +58,7 @@ class Notes(Protocol):
     def room(self, events: int) -> None:
         """Allocate the notes of so many events."""
 
-    def take(self, part: Stretch, now: Snapshot, row: int) -> np.ndarray:
+    def forward(self, part: Stretch, now: Snapshot, row: int) -> np.ndarray:
         """Fold a stretch with notes from a row on, advancing `now`; return the state that answered the last query."""
 
     def back(self, part: Stretch, row: int, before: Snapshot, jump: StateJump | None) -> None:
@@ -161,7 +161,7 @@ class Walk:
     def _run(self, part: Stretch, now: Snapshot, row: int | None) -> np.ndarray:
         """Fold events; return the state that answered the last query."""
         if row is not None:
-            return self._notes.take(part, now, row)
+            return self._notes.forward(part, now, row)
         return self._machine.run_apart(self._log, part.start, part.stop, now, judged=False)[1]
 
 

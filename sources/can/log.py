@@ -69,7 +69,7 @@ class CanLog(Recorded):
         fault = ""
         try:
             while not reader.ended:
-                item = reader.take(self._timeout)
+                item = reader.get(self._timeout)
                 if isinstance(item, Raw):
                     self.frames += item.total
                     batch = self._decoder.decode(self._decoder.frames_of(item))

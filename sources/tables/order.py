@@ -61,7 +61,7 @@ class Order:
             )
         return begin if alone else 0
 
-    def look(self, file: str, line: np.ndarray, t: np.ndarray) -> None:
+    def check(self, file: str, line: np.ndarray, t: np.ndarray) -> None:
         """Check the next rows: their lines and times (ns), each (n,)."""
         if t.size:
             self._backwards(file, line, t)

@@ -113,7 +113,7 @@ def rows_of(
     reader = IsolatedReader(read_rows, path, time, columns, form)
     try:
         while not reader.ended:
-            item = reader.take(timeout())
+            item = reader.get(timeout())
             if item is not None or not reader.ended:
                 yield item
     except SourceError as error:

@@ -115,7 +115,7 @@ class Table(Recorded):
             matched = np.array([isinstance(name, TextMatch) for name in self._columns], np.bool_)
             valued = np.any(np.where(matched, rows.values == 1.0, np.isfinite(rows.values)), axis=0)
             self._valued.update(self._columns[k] for k in np.flatnonzero(valued))
-        self._order.look(path.name, rows.line[used], t[used])
+        self._order.check(path.name, rows.line[used], t[used])
         for name, (keys, values) in self._selectors.items():
             named, valued = (np.any(np.isfinite(rows.values[:, k]) & ~rows.blank[:, k], axis=1) for k in (keys, values))
             for line in rows.line[used & valued & ~named]:

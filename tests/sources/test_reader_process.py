@@ -32,7 +32,7 @@ PATH = Path("recording")  # the functions do not read it
 
 def item_of(reader):
     """The next item, however long this machine takes to start a process."""
-    while (item := reader.take(1.0)) is None:
+    while (item := reader.get(1.0)) is None:
         assert not reader.ended
     return item
 
@@ -59,7 +59,7 @@ class Starved:
     def monotonic(self):
         return self.now
 
-    def ask(self, *_):
+    def submit(self, *_):
         pass
 
     def answer(self, timeout):
@@ -81,13 +81,13 @@ def test_time_in_which_others_have_the_processor_does_not_count(seconds, monkeyp
     monkeypatch.setattr(module, "time", worker)
     reader = IsolatedReader(counting, PATH, 1, timeout=1.5)
     if seconds < 1.5:
-        while (item := reader.take(0.1)) is None:
+        while (item := reader.get(0.1)) is None:
             assert not reader.ended
         assert item == "read" and worker.now > 3.9
     else:
         with pytest.raises(ReaderError, match="gave nothing for 2 s and was ended"):
             while not reader.ended:
-                reader.take(0.1)
+                reader.get(0.1)
         # The first wait counts in full, as no processor time was known before it: 0.1 + 70 × 0.02 = 1.5.
         assert worker.used == pytest.approx(71 * 0.02)
 
@@ -121,7 +121,7 @@ def test_a_reader_that_ends_is_an_error_of_the_file_alone(failure, expected):
     assert pid != os.getpid()
     with pytest.raises(ReaderError, match=expected):
         item_of(reader)
-    assert reader.ended and reader.take(0.0) is None
+    assert reader.ended and reader.get(0.0) is None
     assert isinstance(ReaderError(""), SourceError)
 
 
@@ -139,7 +139,7 @@ def test_a_reader_that_hangs_is_ended():
     reader._timeout = 0.05
     with pytest.raises(ReaderError, match=r"gave nothing for 0 s and was ended"):
         while True:
-            assert reader.take(0.01) is None
+            assert reader.get(0.01) is None
     wait_until_gone(pid)
 
 
@@ -157,7 +157,7 @@ def test_time_in_which_nobody_waits_does_not_count(monkeypatch):
 
     monkeypatch.setattr(module, "time", Slow)
     for _ in range(5):
-        assert reader.take(0.01) is None
+        assert reader.get(0.01) is None
     monkeypatch.undo()
     reader.close()
 
@@ -166,7 +166,7 @@ def test_what_a_library_prints_is_no_item():
     reader = IsolatedReader(pid_then, PATH, shout)
     item_of(reader)
     while not reader.ended:
-        assert reader.take(1.0) is None
+        assert reader.get(1.0) is None
 
 
 def test_a_reader_is_used_again_and_one_that_is_left_is_not_waited_for():
@@ -242,11 +242,11 @@ from tests.sources.readers_that_fail import hang, pid_then
 from pathlib import Path
 from sources.worker_process import IsolatedReader
 reader = IsolatedReader(pid_then, Path('recording'), hang)
-while (pid := reader.take(1.0)) is None:
+while (pid := reader.get(1.0)) is None:
     pass
 print(pid, flush=True)
 while True:
-    reader.take(1.0)
+    reader.get(1.0)
 """
 
 

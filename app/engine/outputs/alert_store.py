@@ -76,7 +76,7 @@ class AlertStore:
         if meant or self._deliveries.counts() != self._written:
             self._write(meant)
         for alert, names in meant:
-            self._deliveries.put(alert, names)
+            self._deliveries.deliver(alert, names)
 
     def _write(self, due: Sequence[tuple[AlertMessage, Sequence[str]]]) -> None:
         if self._store is None or time.monotonic() < self._retry:

@@ -158,7 +158,7 @@ class AlertRules:
         """Alerts that were sent and are not resolved, oldest first."""
         return tuple(item for item in self._open.copy().values() if item.sent is not None)
 
-    def look(self, engine: Engine, message: StateMessage) -> list[tuple[AlertSection, AlertMessage]]:
+    def evaluate(self, engine: Engine, message: StateMessage) -> list[tuple[AlertSection, AlertMessage]]:
         """Return the messages to send now, each with its rule.
 
         Conditions of an estimate that is not known, because the state is waiting, neither begin nor end.

@@ -218,5 +218,5 @@ class Publisher:
     def _look(self, parts: Parts) -> None:
         """Put the alerts that are due into the queues of their receivers."""
         message = state_message(self._engine)
-        self._store.send(parts.rules.look(self._engine, message))
+        self._store.send(parts.rules.evaluate(self._engine, message))
         parts.deliveries.beat(message.twin, message.health)

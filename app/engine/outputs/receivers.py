@@ -266,7 +266,7 @@ class Deliveries:
             if name in self.queues:
                 self.queues[name].put(alert)
 
-    def put(self, alert: AlertMessage, names: Sequence[str]) -> None:
+    def deliver(self, alert: AlertMessage, names: Sequence[str]) -> None:
         """Report an alert, and add it to the queues of the receivers of these names."""
         self._notices.say(f"alert {alert.status}: {alert.text}", level="warn" if alert.status == FIRING else "info")
         for name in names:

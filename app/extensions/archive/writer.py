@@ -70,11 +70,11 @@ class Archive:
         pause = 0.0
         while not self._thread.stopping.wait(pause):
             self._grown.clear()
-            pause = self.look()
+            pause = self.write()
             self._grown.wait(IDLE_PERIOD_S)
-        self.look(closing=True)
+        self.write(closing=True)
 
-    def look(self, *, closing: bool = False) -> float:
+    def write(self, *, closing: bool = False) -> float:
         """Write the rows that are settled, or with `closing` all; return the seconds to the next time."""
         try:
             self._write(closing)

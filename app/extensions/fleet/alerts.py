@@ -72,7 +72,7 @@ class FleetRule:
         self._removed = False
         """Whether the rule is no longer in the YAML."""
 
-    def look(self, names: Sequence[str], table: FleetTable, now: float) -> FleetAlertMessage | None:
+    def evaluate(self, names: Sequence[str], table: FleetTable, now: float) -> FleetAlertMessage | None:
         """Return the message to send now, if any.
 
         Args:
@@ -189,10 +189,10 @@ class FleetRules:
         self._make, self._clock = partial(FleetRule, fleet=fleet, link=link), clock
         self._rules = dict(zip(numbered([rule.title for rule in rules]), map(self._make, rules), strict=True))
 
-    def look(self, names: Sequence[str], table: FleetTable) -> list[tuple[FleetAlertSection, FleetAlertMessage]]:
+    def evaluate(self, names: Sequence[str], table: FleetTable) -> list[tuple[FleetAlertSection, FleetAlertMessage]]:
         """Return the messages to send now, each with its rule."""
         now = self._clock()
-        found = [(item.rule, item.look(names, table, now)) for item in self._rules.values()]
+        found = [(item.rule, item.evaluate(names, table, now)) for item in self._rules.values()]
         return [(rule, message) for rule, message in found if message is not None]
 
     def state(self) -> list[Any]:

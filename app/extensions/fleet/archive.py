@@ -72,7 +72,7 @@ class FleetArchive:
         self._begun = self._failed = False
         self._thread = LoopThread(self._run, "archive")
 
-    def put(self, at: np.ndarray, events: Events) -> None:
+    def append(self, at: np.ndarray, events: Events) -> None:
         """Add events of the assets at the positions `at` (N,); from the thread that folds."""
         with self._lock:
             full = self._count + len(events) > MAX_WAITING
@@ -96,15 +96,15 @@ class FleetArchive:
     def _run(self) -> None:
         pause = 0.0
         while not self._thread.stopping.wait(pause):
-            pause = self.look()
-        self.look(closing=True)
+            pause = self.write()
+        self.write(closing=True)
 
     @contextmanager
     def written(self, rows: Sequence[tuple[np.ndarray, Events]]) -> Iterator[Mapping[str, Any]]:
         """Append events of assets at positions (N,) to the journal, for a transaction of the store in this context.
 
         Yields what the transaction must have: a process that continues from it cuts the journal there. Rows that cannot
-        be written wait, as with `put`.
+        be written wait, as with `append`.
         """
         with self._writing:
             try:
@@ -112,13 +112,13 @@ class FleetArchive:
                 if rows:
                     journal = self._append([self._named(*row) for row in rows], self._stored["store"])
                     self._stored |= {"number": journal.number, "end": journal.size}
-            except Exception as error:  # noqa: BLE001  as in `look`
+            except Exception as error:  # noqa: BLE001  as in `write`
                 self._fail(error)
                 for at, events in rows:
-                    self.put(at, events)
+                    self.append(at, events)
             yield self._stored
 
-    def look(self, *, closing: bool = False) -> float:
+    def write(self, *, closing: bool = False) -> float:
         """Write the rows that wait, and with `closing` complete the file; return the seconds to the next time."""
         try:
             with self._writing:

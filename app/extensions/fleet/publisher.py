@@ -104,9 +104,9 @@ class FleetPublisher:
         """Publish the states that have changed, as many as the connection takes until the next table is due."""
         if mqtt.connections != self._connections:  # what was on its way is lost, and the broker may have none
             self._changed, self._connections = ChangedAssets(), mqtt.connections
-        self._changed.look(table)
+        self._changed.update(table)
         while mqtt.link().connected and not self._thread.stopping.is_set():
-            places = self._changed.take(room := mqtt.room)
+            places = self._changed.pop(room := mqtt.room)
             for place in places:
                 mqtt.publish(asset_message(self._fleet.plan.twin, names[place], table, place))
             if (room and len(places) < room) or time.monotonic() >= due:
@@ -115,7 +115,7 @@ class FleetPublisher:
 
     def _alert(self, names: Sequence[str], table: FleetTable) -> None:
         """Put the alerts that are due into the queues of their receivers."""
-        self._store.send(self._rules.look(names, table))
+        self._store.send(self._rules.evaluate(names, table))
         if not self._fleet.failure:  # a fleet that stands still does not tell that it runs
             self._deliveries.beat(self._fleet.plan.name, HEALTH_NAMES[table.health.max()])
 

@@ -70,7 +70,7 @@ UNKNOWN = -1
 class EventSink(Protocol):
     """Takes the events of a fleet."""
 
-    def put(self, at: np.ndarray, events: Events) -> None:
+    def append(self, at: np.ndarray, events: Events) -> None:
         """Take events of the assets at the positions `at` (N,), at once."""
 
     def written(self, rows: Sequence[tuple[np.ndarray, Events]]) -> AbstractContextManager[Mapping[str, Any]]:
@@ -184,7 +184,7 @@ class RunningFleet:
         """What keeps its state, see `StateWriter`; None without a store."""
         return None if self.file is None else self
 
-    def ask(self) -> None:
+    def request_write(self) -> None:
         """See `StateWriter`."""
         self._asked = True
 
@@ -438,7 +438,7 @@ class RunningFleet:
         """Pass the events to the archive, without the store."""
         if self.archive is not None:
             for at, events in self._unarchived:
-                self.archive.put(at, events)
+                self.archive.append(at, events)
             self._unarchived.clear()
 
     def _continue(self, store: Store) -> None:

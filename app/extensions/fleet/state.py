@@ -22,7 +22,7 @@ class ChangedAssets:
         """Number of the publication of each asset."""
         self._next = 1
 
-    def look(self, table: FleetTable) -> None:
+    def update(self, table: FleetTable) -> None:
         """Note the assets of a table that have changed; new ones have."""
         count, known = len(table.assets), self._due.size
         self._due = np.append(self._due, np.ones(count - known, np.bool_))
@@ -32,7 +32,7 @@ class ChangedAssets:
         self._due[:known] |= ((old != new) & ~(np.isnan(old) & np.isnan(new))).any(axis=1)
         self._known = columns
 
-    def take(self, most: int) -> list[int]:
+    def pop(self, most: int) -> list[int]:
         """Return the positions of at most so many assets, which count as published."""
         places = np.flatnonzero(self._due)
         places = places[np.argsort(self._order[places], kind="stable")][: max(0, most)]

@@ -35,13 +35,13 @@ NS = {"s": 10**9, "ms": 10**6, "us": 1000, "ns": 1}
 def push(arguments: Arguments) -> int:
     """Run the command: 0 if no line was refused, else 1."""
     twin = TwinClient(arguments.url or os.environ.get("NISUS_URL", ""))
-    names = {item["name"] for item in twin.ask()["values"]}
+    names = {item["name"] for item in twin.request()["values"]}
     rows = RowReader(sys.stdin, names, arguments.time, NS[arguments.unit], arguments.source or uuid.uuid4().hex)
     counts: Counter[str] = Counter(accepted=0, duplicate=0, refused=0)
     shown = 0
     try:
         for lines, messages in rows.batches():
-            for item in twin.ask(messages)["items"]:
+            for item in twin.request(messages)["items"]:
                 counts[item["status"]] += 1
                 if item.get("became") == "stale":
                     counts["stale"] += 1
@@ -154,7 +154,7 @@ class TwinClient:
         self._headers = {"Authorization": f"Bearer {token}", "Content-Type": "application/json"}
         self._opener = build_opener(ProxyHandler({}))
 
-    def ask(self, messages: list[Any] | None = None) -> Mapping[str, Any]:
+    def request(self, messages: list[Any] | None = None) -> Mapping[str, Any]:
         """Return the answer to messages, or to the question for names; wait while the twin is not there.
 
         Raises:

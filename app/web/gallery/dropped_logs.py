@@ -108,7 +108,7 @@ class ReaderJob(Job):
             with closing(IsolatedReader(function, path, *args, timeout=JOB_TIMEOUT_S, keep=False)) as reader:
                 while not reader.ended:
                     self.check()
-                    item = reader.take(0.2)
+                    item = reader.get(0.2)
                     self.item = self.item if item is None else item
             self.check()
             self._then(self.item)

@@ -181,9 +181,9 @@ class SavedFiles:
         self._files = running.opening.files
         self._known = self._seen = running.opening.stamp
         if running.opening.again is not None:
-            running.engine.jobs.run("saved files", self.look, every=FILE_POLL_PERIOD_S)
+            running.engine.jobs.run("saved files", self.check, every=FILE_POLL_PERIOD_S)
 
-    def look(self, job: Job | None = None) -> None:
+    def check(self, job: Job | None = None) -> None:
         """Look once; reload when a file has changed since it was read, but not since the last look."""
         running, again = self._running, self._running.opening.again
         assert again is not None

@@ -98,7 +98,7 @@ class Recordings:
                 return
             self._looking = True
 
-        def look() -> None:
+        def read() -> None:
             from ...record.reader import facts_of
 
             try:
@@ -110,7 +110,7 @@ class Recordings:
             finally:
                 self._looking = False
 
-        threading.Thread(target=look, name="recordings", daemon=True).start()
+        threading.Thread(target=read, name="recordings", daemon=True).start()
 
     def _elsewhere(self) -> dict[str, Path]:
         """Return by name the recordings of this session outside the folder; files in the folder take precedence."""

@@ -379,14 +379,14 @@ def test_a_pinned_run_that_fails_ends_and_its_kept_rows_stay(stepped):
 
 
 def test_the_smoothed_run_is_the_smoothed_fold_and_follows_the_running_one(monkeypatch):
-    looks = []
-    monkeypatch.setattr(Smoother, "__init__", _without_a_job(Smoother.__init__, looks))
+    smoothers = []
+    monkeypatch.setattr(Smoother, "__init__", _without_a_job(Smoother.__init__, smoothers))
     stepped = Stepped().put(readings(*walk(N)))
     viewer = Viewer(Series(stepped.engine), MEAN, UPPER, run=SMOOTHED, points=4000)
     assert viewer.look() == 0
 
     def compared(tuning, n):
-        looks[0].look(Job("test"))
+        smoothers[0].update(Job("test"))
         viewer.look()
         expected = folded(tuning, n, smoothed=True)
         np.testing.assert_allclose(viewer.values[MEAN], expected.mean[:, 0], rtol=1e-6)
@@ -397,20 +397,20 @@ def test_the_smoothed_run_is_the_smoothed_fold_and_follows_the_running_one(monke
     compared(FIRST, 2 * N)
     stepped.submit(commands.SetTuning("Q.rate", 0.1))
     compared(SECOND_RUN, 2 * N)
-    job = looks[0].job
+    job = smoothers[0].job
     viewer.close()
     assert not job.wanted
     # A filter without a smoother gives the reason.
     stepped.submit(commands.SetEstimator("filterpy-kf"))
     viewer = Viewer(Series(stepped.engine), MEAN, run=SMOOTHED)
     assert viewer.look() == 0
-    looks[1].look(Job("test"))
+    smoothers[1].update(Job("test"))
     assert viewer.look() == 0
     assert any("filterpy-kf cannot be smoothed" in text for text in stepped.notices())
 
 
 def _without_a_job(init, made):
-    """Smoothers are collected, so that a test calls `look` itself."""
+    """Smoothers are collected, so that a test calls `update` itself."""
 
     def collected(self, engine):
         init(self, engine)
@@ -435,5 +435,5 @@ def test_smoothed_rows_carry_the_version_of_the_model():
             jobs=Jobs(notices),
         )
     )
-    smoother.look(Job("test"))
+    smoother.update(Job("test"))
     assert smoother.latest.version == 2

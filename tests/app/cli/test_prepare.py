@@ -37,17 +37,17 @@ def test_a_call_that_does_not_return_is_named_once():
     watch = CallWatch(MODEL, clock=lambda: now)
     thread = call()
     try:
-        assert watch.look() is None
+        assert watch.check() is None
         now = CALL_TIMEOUT_S - 0.1
-        assert watch.look() is None
+        assert watch.check() is None
         now = CALL_TIMEOUT_S
-        line = watch.look()
+        line = watch.check()
         assert line is not None and "\n" not in line
         place, rest = line.split(": ", 1)
         assert place.endswith(f"test_prepare.py:{waits.__code__.co_firstlineno + 1}")  # where it waits
         assert rest.startswith("f of the model slow has not returned for 10 s; ") and "Ctrl-C" in rest
         now = 100.0
-        assert watch.look() is None
+        assert watch.check() is None
     finally:
         LEAVE.set()
         thread.join(LIMIT_S)
@@ -58,12 +58,12 @@ def test_calls_that_return_are_not():
     watch = CallWatch(MODEL, clock=lambda: now)
     for _ in range(3):  # each of them looked at twice, and longer than the patience in sum
         thread = call()
-        assert watch.look() is None
+        assert watch.check() is None
         now += 0.6 * CALL_TIMEOUT_S
-        assert watch.look() is None
+        assert watch.check() is None
         LEAVE.set()
         thread.join(LIMIT_S)
-    assert watch.look() is None
+    assert watch.check() is None
 
 
 def test_attended_work_gives_what_it_gives():

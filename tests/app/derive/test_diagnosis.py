@@ -140,7 +140,7 @@ def test_only_the_last_rows_are_looked_at():
 def test_nothing_is_said_before_the_first_reading():
     stepped = Stepped()
     engine = stepped.engine
-    said = json.loads(json.dumps(Diagnosis(engine).look(), allow_nan=False))
+    said = json.loads(json.dumps(Diagnosis(engine).figures(), allow_nan=False))
     assert said["events"] == 0 and said["rows"][0]["verdict"] == "winding: no reading among the last rows"
 
 

@@ -32,7 +32,7 @@ def running(n=200):
 
 
 def ask(engine, **body):
-    answer = Forecasts(engine).ask(question_from_json(body, engine.model))
+    answer = Forecasts(engine).compute(question_from_json(body, engine.model))
     return json.loads(json.dumps(answer, allow_nan=False))
 
 

@@ -44,10 +44,10 @@ class Refitted(Stepped):
 
     def look(self):
         """To the end of a fit, if one is due; the state of the last one."""
-        self.refits.look()
+        self.refits.update()
         self.engine.settle()
         if self.refits.known and self.refits.known[-1].state == FITTING:
-            self.refits.look()
+            self.refits.update()
             self.engine.settle()
         return self.refits.known[-1].state if self.refits.known else None
 
@@ -194,17 +194,17 @@ def test_the_engine_goes_on_if_a_fit_fails(begin, monkeypatch):
 def test_events_are_folded_while_a_fit_is_under_way(begin):
     twin = begin()
     twin.measure(WINDOW + 1, 5.0)
-    twin.refits.look()
+    twin.refits.update()
     engine = twin.engine
     # Rows come, and the fit that is due meanwhile waits.
     engine._accept([readings([WINDOW + 2.0], [40.0])])
     assert row_count(engine) == (WINDOW + 1) * RATE + 1
-    twin.refits.look()
+    twin.refits.update()
     assert [item.state for item in twin.refits.known] == [FITTING]
     with pytest.raises(ConfigError, match="another one is under way"):
         twin.refits.now()
     engine.settle()
-    twin.refits.look()
+    twin.refits.update()
     assert twin.refits.known[-1].state == OFFERED
 
 

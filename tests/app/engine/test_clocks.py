@@ -103,9 +103,9 @@ def test_it_waits_until_then():
     now, notices = [100.0], Notices(lambda: 0)
     silence = SilentSource(notices, 15.0, lambda: now[0])
     for now[0], is_live, health in ((115.0, True, WAITING), (115.1, False, WAITING), (115.1, True, STALE)):
-        silence.look(live=is_live)
+        silence.check(live=is_live)
         assert silence.health == health
-    silence.look(live=True)
+    silence.check(live=True)
     assert len(notices.since(0)) == 1
     silence.broken()
     silence.broken()

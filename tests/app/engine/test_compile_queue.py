@@ -210,7 +210,7 @@ def test_what_is_asked_for_comes_first_and_the_rest_is_done_at_the_lowest_priori
     compile_queue, told = shop(ukf=1, ckf=1, pf=1), []
     compile_queue.start()
     wait_for(lambda: begun(tmp_path, Piece("ukf", 0)))
-    compile_queue.ask("pf", told.append)
+    compile_queue.request("pf", told.append)
     wait_for(lambda: begun(tmp_path, Piece("pf", 0)))
     assert begun(tmp_path, Piece("ckf", 0)) is None and not told
     states = compile_queue.states()
@@ -222,7 +222,7 @@ def test_what_is_asked_for_comes_first_and_the_rest_is_done_at_the_lowest_priori
     for name in ("ukf", "ckf"):
         assert begun(tmp_path, Piece(name, 0))[1] == 19
     asked = []
-    compile_queue.ask("ukf", asked.append)
+    compile_queue.request("ukf", asked.append)
     assert asked == ["ukf"]
 
 
@@ -230,8 +230,8 @@ def test_what_fails_in_the_queue_is_left_to_who_uses_it(shop, tmp_path):
     compile_queue, told = shop(ukf=1, ckf=2), []
     paper(tmp_path, "fail", Piece("ukf", 0)).touch()
     compile_queue.start()
-    compile_queue.ask("ukf", told.append)
-    compile_queue.ask("ckf", told.append)
+    compile_queue.request("ukf", told.append)
+    compile_queue.request("ckf", told.append)
     wait_for(lambda: begun(tmp_path, Piece("ukf", 0)) and begun(tmp_path, Piece("ckf", 0)))
     paper(tmp_path, "go", Piece("ukf", 0)).touch()
     wait_for(lambda: told == ["ukf"])
@@ -257,7 +257,7 @@ def test_what_was_ended_from_outside_is_begun_once_more_and_said(shop, tmp_path)
     for place in (1, 2):
         paper(tmp_path, "go", Piece("enkf", place)).touch()
     compile_queue.start()
-    compile_queue.ask("enkf", told.append)
+    compile_queue.request("enkf", told.append)
     process = killed(tmp_path, first)
     wait_for(lambda: len(said) == 1)
     assert "enkf was killed" in said[0] and said[0].endswith("compiled again")
@@ -287,7 +287,7 @@ def test_what_a_source_needs_comes_first_and_is_waited_for_alone(shop, tmp_path)
     compile_queue = shop(**{LOOP: 1, "ukf": 4, FRAMES: 1})
     waiting = threading.Thread(target=compile_queue.wait, args=(FRAMES,), daemon=True)
     for name in ("ukf", FRAMES):
-        compile_queue.ask(name)
+        compile_queue.request(name)
     waiting.start()
     compile_queue.start()
     wait_for(lambda: begun(tmp_path, Piece(FRAMES, 0)))
@@ -308,7 +308,7 @@ def test_workers_that_began_before_the_queue_compile_in_it(tmp_path):
     piece = Piece("ukf", 0)
     pieces = {"ukf": [piece]}
     busy = CompileQueue(["ukf"], pieces=lambda name: pieces.get(name, []), is_done=lambda _: False, workers=[worker])
-    busy.ask("ukf")
+    busy.request("ukf")
     busy.start()
     wait_for(lambda: begun(tmp_path, piece))
     assert begun(tmp_path, piece)[0] == worker._process.pid

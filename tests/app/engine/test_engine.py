@@ -159,7 +159,7 @@ def test_a_source_that_begins_to_hold_its_values_is_an_episode(step, std, told):
     stepped = Stepped(source=Scripted(live=True))
     for rows in np.array_split(np.arange(t.size), 42):
         stepped.put(readings(t[rows], np.round(y[rows] / step) * step if step else y[rows]))
-        stepped.engine._watchers.repeats.look(Job("repeats"))
+        stepped.engine._watchers.repeats.check(Job("repeats"))
     found = stepped.engine._watchers.repeats.entries
     assert len(found) == told
     for entry in found:
@@ -552,12 +552,12 @@ def test_the_same_failure_is_said_once_however_long_it_lasts():
         solver.away = away
         log.extend(readings([k + 1.0], [40.0]))
         growing.advance()
-        watch.look(growing, k)
+        watch.report(growing, k)
     texts = [line.text for line in notices.since(0)]
     assert sum("the solver is away" in text for text in texts) == 1
     assert sum("measurement could not be used" in text for text in texts) == 3
     watch.again()
-    watch.look(growing, growing.n)
+    watch.report(growing, growing.n)
     assert sum("the solver is away" in line.text for line in notices.since(0)) == 2
 
 

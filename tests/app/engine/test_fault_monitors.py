@@ -45,7 +45,7 @@ def test_the_status_shows_the_sensitivity_of_the_same_events():
     engine = stepped.engine
     before = status_json(engine)
     assert (before["integrity"], before["integrity_age"]) == ({}, None)
-    engine._watchers.integrity.look(Job("test"))
+    engine._watchers.integrity.update(Job("test"))
     found = stepped.status().integrity
     log = as_log(readings(*random_walk(600)))
     tuning, name = engine.folded_with()
@@ -82,10 +82,10 @@ def test_levels_of_one_revision_are_computed_rarely_and_those_of_another_at_once
     compute = watch._compute
     monkeypatch.setattr(watch, "_compute", lambda taken, job: (computed.append(taken.revision), compute(taken, job))[1])
     for _ in range(3):
-        watch.look(Job("test"))
+        watch.update(Job("test"))
     assert computed == [0] and watch.of(0) is not None and watch.of(1) is None
     revision = 1
-    watch.look(Job("test"))
+    watch.update(Job("test"))
     assert computed == [0, 1] and watch.of(0) is None and watch.of(1) is not None
 
 
@@ -102,7 +102,7 @@ def test_a_window_starts_at_a_snapshot_and_is_a_copy():
 def test_a_part_of_the_log_continues_from_the_snapshot_before_it():
     fold = folded(3000)
     watch = monitor(fold, 200)
-    watch.look(Job("test"))
+    watch.update(Job("test"))
     whole = sensitivity("kf", MODEL, fold.tuning, fold.log, most=200, false_alarm=FALSE_ALARM)
     assert_close(watch.of(0).bounds, bounds_of(MODEL, whole), 1e-9)
 
@@ -111,15 +111,15 @@ def test_nothing_is_computed_twice_nor_without_events_nor_once_cancelled():
     watch, job = monitor(folded(300)), Job("test")
     job.cancel()
     with pytest.raises(JobCancelled):
-        watch.look(job)
+        watch.update(job)
     assert watch.of(0) is None
-    watch.look(Job("test"))
+    watch.update(Job("test"))
     first = watch.of(0)
     watch._due = 0.0
-    watch.look(Job("test"))
+    watch.update(Job("test"))
     assert watch.of(0) is first is not None
     empty = ProtectionMonitor(lambda: None, FALSE_ALARM)
-    empty.look(Job("test"))
+    empty.update(Job("test"))
     assert empty.of(0) is None
 
 
@@ -129,7 +129,7 @@ def test_filters_that_draw_and_large_fields_have_a_reason_instead():
     large = EventWindow("ekf", twin().tuning, log.events, folded(1).track, None, 0)
     for taken, reason in ((event_window(folded(300, "pf"), 0, 4000), "pf draws at random"), (large, "")):
         watch = ProtectionMonitor(lambda taken=taken: taken, FALSE_ALARM)
-        watch.look(Job("test"))
+        watch.update(Job("test"))
         assert watch.of(0).bounds == {} and watch.of(0).reason.startswith(reason) and watch.of(0).reason
     assert reason_against(MODEL, "kf") == ""
 

@@ -41,7 +41,7 @@ class Session(Stepped):
 
     def write(self):
         """Write the store."""
-        self.running.store.look()
+        self.running.store.write()
         return self
 
     def kill(self):

@@ -145,19 +145,19 @@ def test_work_that_takes_long_is_named_only_if_a_question_is_not_answered(monkey
     with monkeypatch.context() as patch, watchdog.watched(Work(("f", lambda: None), ("h", lambda: None))):
         patch.setattr(app.engine.watchdog, "ANSWER_TIMEOUT_S", LIMIT_S)
         now = CHECK_AFTER_S + 1.0
-        watchdog.look()
+        watchdog.check()
         assert watchdog.text is None
         now = STALLED_AFTER_S + 1.0
-        watchdog.look()
+        watchdog.check()
         assert watchdog.text is not None and watchdog.text.startswith("a fold has not returned for 61 s; ")
-    watchdog.look()
+    watchdog.check()
     assert watchdog.text is None and [level for level, _ in said] == ["error", "info"]
     with watchdog.watched(Work(("f", lambda: None), ("h at x", leave.wait), ("never asked", lambda: None))):
         now += CHECK_AFTER_S - 0.1
-        watchdog.look()
+        watchdog.check()
         assert watchdog.text is None
         now += 0.2
-        watchdog.look()
+        watchdog.check()
         assert watchdog.text is not None and watchdog.text.startswith("h at x has not returned for 3 s; ")
     leave.set()
 

@@ -300,7 +300,7 @@ def test_variances_that_readings_bring_are_recorded(running, tmp_path):
         source.put(plain if np.isnan(variance) else plain._replace(value=wide))
         # In the file before the next come: it has parts without variances, and parts with.
         wait_for(lambda n=2 * first: recorder._open is not None and recorder._open.file.rows == n)
-        history.take(engine.pull(cursor))
+        history.update(engine.pull(cursor))
     seen = pull_all(engine)
     engine.submit(commands.Record(None))
     wait_for(lambda: recorder.finished == [path])

@@ -116,8 +116,8 @@ def pull(first, t, fresh=False):
 
 def test_history_overwrites_rewritten_rows():
     history = History(1, 1)
-    assert history.take(pull(0, [0, 10, 20, 30])) == 0
-    assert history.take(pull(2, [15, 20, 30])) == 2
+    assert history.update(pull(0, [0, 10, 20, 30])) == 0
+    assert history.update(pull(2, [15, 20, 30])) == 2
     np.testing.assert_array_equal(history.column("t"), [0, 10, 15, 20, 30])
 
 
@@ -125,7 +125,7 @@ def test_history_slides():
     history = History(1, 1)
     history.span = 1_000
     for first in range(0, 100_000, 500):
-        history.take(pull(first, range(100 + first, 600 + first)))
+        history.update(pull(first, range(100 + first, 600 + first)))
         history.trim()
     assert history.n <= 2_000
     np.testing.assert_array_equal(history.column("mean")[:, 0] + 100, history.column("t"))
@@ -134,15 +134,15 @@ def test_history_slides():
 def test_history_never_holds_more_than_twice_its_limit():
     history = History(1, 1, limit=100)
     for first in range(0, 1_000, 90):
-        history.take(pull(first, range(first, first + 90)))
+        history.update(pull(first, range(first, first + 90)))
         assert 90 <= history.n <= 200
         np.testing.assert_array_equal(history.column("t"), np.arange(history.base, first + 90))
 
 
 def test_history_starts_over_with_a_fresh_pull():
     history = History(1, 1)
-    history.take(pull(0, range(100)))
-    history.take(pull(40, range(40, 60), fresh=True))
+    history.update(pull(0, range(100)))
+    history.update(pull(40, range(40, 60), fresh=True))
     assert (history.base, history.n) == (40, 20)
 
 

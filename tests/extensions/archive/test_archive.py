@@ -39,11 +39,11 @@ class Session(StoredSession):
     def put(self, *batches):
         for batch in batches:
             super().put(batch)
-            self.archive.look()
+            self.archive.write()
         return self
 
     def close(self):
-        self.archive.look(closing=True)
+        self.archive.write(closing=True)
         return self
 
     def notices(self):
@@ -91,7 +91,7 @@ def test_the_rows_are_those_of_the_fold_of_the_same_log(tmp_path, monkeypatch):
     while engine._feeder.read(0.0) is not None:
         while not engine._inbox.empty():
             engine._round(0.0)
-        session.archive.look()
+        session.archive.write()
     engine.settle()
     session.close()
     assert main(["fold", "winding.yaml", "--out", "fold.parquet"]) == 0
@@ -148,7 +148,7 @@ def test_a_folder_that_cannot_be_written_is_one_notice_and_loses_nothing(tmp_pat
     free = archives.Disk.free
     monkeypatch.setattr(archives.ParquetPart, "write", lambda *_: (_ for _ in ()).throw(OSError(28, "No space left")))
     session.put(batch.select(slice(1500, 1700)))
-    session.archive.look(closing=True)
+    session.archive.write(closing=True)
     assert list((tmp_path / "winding").glob("*")) == []
     monkeypatch.undo()
     monkeypatch.setattr(archives.Disk, "free", lambda self: -1)
@@ -177,7 +177,7 @@ def test_a_killed_process_leaves_complete_files_and_its_store_continues_them(tmp
     session = Session(tmp_path, split=split, store=store).put(
         *(batch.select(slice(k, k + 100)) for k in range(0, 3000, 100))
     )
-    session.running.store.look()
+    session.running.store.write()
     session.archive._part = archives.ParquetPart(tmp_path / "winding")
     session.running.store._store.close()
     session.archive._part._file.close()  # as the end of the process does, and with it the lock

@@ -54,7 +54,7 @@ class Looked:
     def at(self, t, *health, causes=()):
         """The message that is due at a time, None if there is none."""
         self.now = t
-        found = self.rules.look(names(len(health)), table(health, causes))
+        found = self.rules.evaluate(names(len(health)), table(health, causes))
         return found[0][1] if found else None
 
 
@@ -75,7 +75,7 @@ def test_each_asset_fires_and_recovers_when_a_twin_would(after, clear):
             one = single.setdefault(name, AlertRules(
                 [AlertSection(health="degraded", after=after, clear=clear, repeat="never")], clock=lambda: clock.now
             ))  # fmt: skip
-            for _, alert in one.look(SimpleNamespace(mute=None, episodes=list), state(health=grade)):
+            for _, alert in one.evaluate(SimpleNamespace(mute=None, episodes=list), state(health=grade)):
                 found[alert.status].add(name)
         assert (message is not None) == any(found.values())
         if message is not None:
@@ -203,7 +203,7 @@ def test_assets_in_alarm_are_known_after_a_restart_in_any_order():
         """Look at assets that come in another order than before."""
         after.now = t
         names = [name.replace("_", " ") for name in health]
-        found = after.rules.look(names, table(list(health.values()))._replace(assets=names))
+        found = after.rules.evaluate(names, table(list(health.values()))._replace(assets=names))
         return found[0][1] if found else None
 
     # Parts of the fleet start one after another; one does not report any more.

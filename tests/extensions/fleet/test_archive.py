@@ -74,9 +74,9 @@ def test_the_fold_of_archived_rows_has_the_bits_of_the_fleet(closing, tmp_path):
     for part in np.array_split(np.array(messages(), object), 9):
         assert {item.status for item in source.send(part.tolist())} == {"accepted"}
         fleet.step()
-        fleet.archive.look()
+        fleet.archive.write()
     _, names, table = fleet.table()
-    fleet.archive.look(closing=closing)
+    fleet.archive.write(closing=closing)
     archive = tmp_path / "archive" / "drives"
     assert bool(parts_of(archive)) == closing and table.stale.sum() == 0
     for k, asset in enumerate(names):
@@ -108,13 +108,13 @@ def test_rows_of_a_store_are_archived_once_whenever_it_is_killed(killed, tmp_pat
     fleet, source = started(tmp_path, store=store)
     steps(fleet, source, parts[:3])
     if killed == "and completed":
-        fleet.archive.look(closing=True)
+        fleet.archive.write(closing=True)
     if killed != "before the transaction":
         kill(fleet)
     if killed == "and a journal of none":
         other, its = started(tmp_path)
         steps(other, its, [parts[5]])
-        other.archive.look()
+        other.archive.write()
         other.archive._journal._file.close()
     if killed == "before the transaction":
         monkeypatch.setattr(fleet.file, "write_blocks", lambda blocks: 1 / 0)
@@ -123,10 +123,10 @@ def test_rows_of_a_store_are_archived_once_whenever_it_is_killed(killed, tmp_pat
         kill(fleet)
     again, source = started(tmp_path, store=store)
     steps(again, source, parts[3:5] if killed == "and a journal of none" else parts[3:])
-    again.archive.look()
+    again.archive.write()
     kill(again)
     last, source = started(tmp_path, store=store)
-    last.archive.look(closing=True)
+    last.archive.write(closing=True)
     found = pa.concat_tables([pq.read_table(path) for path in parts_of(folder)])
     rows = ["asset", "t_ns", "event", "channel"]
     assert found.select(rows).group_by(rows).aggregate([]).num_rows == found.num_rows
@@ -151,7 +151,7 @@ def test_rows_of_a_store_wait_while_the_archive_cannot_be_written(tmp_path, monk
     (tmp_path / "archive" / "drives").unlink()
     source.send(messages(seed=2, assets=1, count=1))
     fleet.step()
-    fleet.archive.look(closing=True)
+    fleet.archive.write(closing=True)
     found = [pq.read_table(path).num_rows for path in parts_of(tmp_path / "archive" / "drives")]
     assert len(found) == 2 and sum(found) == sum(
         column.sum() for column in (fleet.table()[2].events, fleet.table()[2].stale)
@@ -176,7 +176,7 @@ def test_the_rows_of_an_asset_are_in_one_or_two_groups_of_a_file_and_old_files_a
     written = Written(tmp_path, Split(size=30_000.0))
     for k in range(0, 3000, 500):
         written.put(k, 500)
-    written.archive.look(closing=True)
+    written.archive.write(closing=True)
     parts = parts_of(written.folder)
     assert len(parts) >= 2
     read = []
@@ -196,7 +196,7 @@ def test_each_row_of_an_asset_is_read_once_while_files_are_completed(tmp_path):
     for k in range(0, 600, 10):
         written.put(k)
         if rng.random() < 0.2:
-            written.archive.look(closing=True)
+            written.archive.write(closing=True)
         if rng.random() < 0.5 and (rows := history.read(10**6)) is not None:
             found += rows["value_0"].to_pylist()
         files.add(len(parts_of(written.folder)))
@@ -237,7 +237,7 @@ def test_a_folder_that_cannot_be_written_is_one_report_and_loses_nothing(tmp_pat
     monkeypatch.setattr(archives.Journal, "write", full)
     written.put(30)
     monkeypatch.setattr(archives.Journal, "write", flush)
-    written.put(40).archive.look(closing=True)
+    written.put(40).archive.write(closing=True)
     assert written.values() == [*map(float, range(50))]
     assert len(written.said) == 2 and "No space left on device" in written.said[1]
 
@@ -247,7 +247,7 @@ def test_rows_beyond_those_that_may_wait_are_dropped_and_counted(tmp_path, monke
     (tmp_path / "pumps").write_text("")
     written = Written(tmp_path).put(0).put(10).put(20)
     (tmp_path / "pumps").unlink()
-    written.archive.look()
+    written.archive.write()
     assert written.said[1:] == [f"archive {written.folder}: 10 rows were dropped; the disk is too slow"]
     assert written.values() == [*map(float, range(20))]
 
@@ -266,7 +266,7 @@ def test_rows_whose_write_fails_late_are_archived_once(tmp_path, monkeypatch):
         monkeypatch.setattr(archives.os, "fsync", full if k in (0, 2) else synced)
         source.send(part.tolist())
         fleet.step()
-    fleet.archive.look(closing=True)
+    fleet.archive.write(closing=True)
     assert fleet.counts["archive"] == 1
     table = fleet.table()[2]
     found = [pq.read_table(path).num_rows for path in parts_of(tmp_path / "archive" / "drives")]
@@ -283,7 +283,7 @@ def test_a_journal_in_a_folder_that_was_emptied_is_cut_as_in_the_old_one(tmp_pat
     for part in (sent[:14], sent[14:28]):
         source.send(part)
         fleet.step()
-        fleet.archive.look(closing=True)
+        fleet.archive.write(closing=True)
     for path in folder.iterdir():
         path.unlink()
     monkeypatch.setattr(fleet.file, "write_blocks", lambda blocks: 1 / 0)
@@ -295,7 +295,7 @@ def test_a_journal_in_a_folder_that_was_emptied_is_cut_as_in_the_old_one(tmp_pat
     again, source = started(tmp_path, store=store)
     source.send(sent[28:])
     again.step()
-    again.archive.look(closing=True)
+    again.archive.write(closing=True)
     found = pa.concat_tables([pq.read_table(path) for path in parts_of(folder)])
     found = found.select(["asset", "t_ns", "event", "channel"])
     assert found.num_rows and found.group_by(found.column_names).aggregate([]).num_rows == found.num_rows

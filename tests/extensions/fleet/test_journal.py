@@ -34,7 +34,7 @@ def test_two_processes_do_not_write_into_one_folder(tmp_path):
     first = Written(tmp_path).put(0)
     second = Written(tmp_path).put(10)
     assert "another process writes into it" in second.said[0]
-    first.archive.look(closing=True)
+    first.archive.write(closing=True)
     assert second.put(20).values() == [*map(float, range(30))]
 
 
@@ -53,5 +53,5 @@ def test_a_journal_that_begins_while_another_is_completed_has_a_number_of_its_ow
     with monkeypatch.context() as patch:
         patch.setattr(archive_journal, "parts_of", meanwhile)
         written.put(10)
-    written.archive.look(closing=True)
+    written.archive.write(closing=True)
     assert written.said == [] and written.values() == [*map(float, range(20))]

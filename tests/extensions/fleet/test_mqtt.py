@@ -116,14 +116,14 @@ def test_a_state_that_is_not_known_has_no_number():
 def test_those_that_waited_longest_are_published_first():
     changed, known = ChangedAssets(), table(["tracking"] * 5)
     known = known._replace(seconds=np.array([1.0, 1.0, 1.0, 1.0, np.nan]))  # one without a measurement
-    changed.look(known)
-    assert changed.take(3) == [0, 1, 2]
-    changed.look(known._replace(events=np.array([1, 0, 1, 0, 0])))
-    assert changed.take(3) == [3, 4, 0] and changed.take(9) == [2] and changed.take(9) == []
-    changed.look(known._replace(events=np.array([1, 0, 1, 0, 0]), health=known.health + np.int8(0)))
-    assert changed.take(9) == []
+    changed.update(known)
+    assert changed.pop(3) == [0, 1, 2]
+    changed.update(known._replace(events=np.array([1, 0, 1, 0, 0])))
+    assert changed.pop(3) == [3, 4, 0] and changed.pop(9) == [2] and changed.pop(9) == []
+    changed.update(known._replace(events=np.array([1, 0, 1, 0, 0]), health=known.health + np.int8(0)))
+    assert changed.pop(9) == []
     more = table(["tracking"] * 4 + ["stale"] * 2)._replace(
         events=np.array([1, 0, 1, 0, 0, 0]), seconds=np.append(known.seconds, np.nan)
     )
-    changed.look(more)
-    assert changed.take(0) == [] and changed.take(9) == [5, 4]
+    changed.update(more)
+    assert changed.pop(0) == [] and changed.pop(9) == [5, 4]

@@ -326,8 +326,8 @@ def test_a_store_on_a_full_disk_is_tried_again_while_the_fleet_goes_on(tmp_path,
     first, said = running(tmp_path)
     path = tmp_path / "fleet.store"
     fleet = RunningFleet(first.plan, lambda key, text: said.append(text), threads=1, store=path)
-    fleet.archive = SimpleNamespace(put=lambda at, events: archived.append(len(events)), stop=lambda: None)
-    fleet.archive.written = lambda rows: nullcontext([fleet.archive.put(*row) for row in rows])
+    fleet.archive = SimpleNamespace(append=lambda at, events: archived.append(len(events)), stop=lambda: None)
+    fleet.archive.written = lambda rows: nullcontext([fleet.archive.append(*row) for row in rows])
     source = messages_of(fleet)
     for k in range(6):
         full[0] = 1 < k < 5

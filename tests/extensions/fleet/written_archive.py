@@ -29,8 +29,8 @@ class Written:
         """Put rows at consecutive seconds, whose value is their number."""
         number = np.arange(first, first + count)
         t = BEGIN + number * SECOND
-        self.archive.put(number % 5, Events.alike(READING, t, number.astype(float)))
-        self.archive.look()
+        self.archive.append(number % 5, Events.alike(READING, t, number.astype(float)))
+        self.archive.write()
         return self
 
     def values(self):

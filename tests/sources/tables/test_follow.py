@@ -164,7 +164,7 @@ def test_a_restart_from_a_store_takes_no_row_twice(tmp_path):
     running = begin()
     settle(running)
     assert running.engine.end() == 600
-    running.store.look()
+    running.store.write()
     with (inbox / "b.csv").open("a") as file:
         file.write(lines(600, 620))
     settle(running)

@@ -101,7 +101,7 @@ class Process:
 
     def look(self, t, **fields):
         self.looked.now = t
-        due = self.looked.rules.look(self.looked.engine, state(**fields))
+        due = self.looked.rules.evaluate(self.looked.engine, state(**fields))
         self.store.send(due)
         return self
 

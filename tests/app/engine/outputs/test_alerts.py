@@ -56,7 +56,7 @@ class Looked:
 
     def messages(self, t, **fields):
         self.now = t
-        return [alert for _, alert in self.rules.look(self.engine, state(**fields))]
+        return [alert for _, alert in self.rules.evaluate(self.engine, state(**fields))]
 
     def at(self, t, **fields):
         return [alert.status for alert in self.messages(t, **fields)]

@@ -231,18 +231,18 @@ def test_a_file_is_read_once_it_stays_as_it_is(pump):
     running.opening.again = lambda: read.append(pump.read_text()) or load_twin(pump)
     running.engine.twin = load_twin(pump)
     files = SavedFiles(Mock(starting=None), running)
-    files.look()
+    files.check()
     save(pump, YAML + "#")
-    files.look()
+    files.check()
     assert not read  # it may be written on
     save(pump, YAML + "# a comment\n")
-    files.look()
+    files.check()
     assert not read
-    files.look()
+    files.check()
     assert read == [YAML + "# a comment\n"] and not running.engine.reload.called and running.server.unread is None
     save(pump, YAML.replace("0.01", "0.02"))
     for _ in range(3):
-        files.look()
+        files.check()
     assert len(read) == 2 and [call.args[1] for call in running.engine.reload.mock_calls] == ["pump.yaml saved"]
 
 

@@ -194,5 +194,5 @@ def test_a_withheld_estimate_has_its_reason_in_place_of_a_value_and_a_band_witho
         engine = session.engine
         assert np.isnan(engine.belief().mean[1]) and np.isfinite(engine.belief().mean[0])
         assert belief_json(engine, [0, 1]) is None
-        told = Forecasts(engine).ask(question_from_json({"horizon": 5.0}, engine.model))["states"]
+        told = Forecasts(engine).compute(question_from_json({"horizon": 5.0}, engine.model))["states"]
         assert set(told["rate"]["mean"]) == {None} and None not in told["rate"]["upper2"] + told["temperature"]["mean"]
