@@ -36,8 +36,8 @@ layout = register_jitable
 """Decorator of a layout that stands in others: in Python a plain function, within a kernel compiled."""
 
 
-class Part(NamedTuple):
-    """What a layout hands out in Python: where an array begins, in bytes, and its shape."""
+class ArrayLayout(NamedTuple):
+    """Place of an array in scratch memory, as Python sees it: first byte and shape."""
 
     at: int
     shape: tuple[int, ...]
@@ -45,17 +45,17 @@ class Part(NamedTuple):
 
 def take_matrix(at: int, rows: int, columns: int) -> tuple[Any, int]:
     """A matrix (rows, columns) that begins at the address `at`, and the address after it."""
-    return Part(at, (rows, columns)), at + WORD * rows * columns
+    return ArrayLayout(at, (rows, columns)), at + WORD * rows * columns
 
 
 def take_vector(at: int, n: int) -> tuple[Any, int]:
     """A vector (n,) that begins at the address `at`, and the address after it."""
-    return Part(at, (n,)), at + WORD * n
+    return ArrayLayout(at, (n,)), at + WORD * n
 
 
 def take_integers(at: int, n: int) -> tuple[Any, int]:
     """A vector (n,) of int64s that begins at the address `at`, and the address after it."""
-    return Part(at, (n,)), at + WORD * n
+    return ArrayLayout(at, (n,)), at + WORD * n
 
 
 _TAKES = (take_matrix, take_vector, take_integers)
@@ -141,7 +141,7 @@ def size_of(workspace: Callable[..., Any], *sizes: int) -> int:
     return int(plain(workspace)(0, *sizes)[-1]) // WORD
 
 
-def view(part: Part, array: np.ndarray) -> np.ndarray:
+def view(part: ArrayLayout, array: np.ndarray) -> np.ndarray:
     """A part of a layout, called from address zero, as a view of the float64s that it lays out."""
     begin = part.at // WORD
     return array[begin : begin + int(np.prod(part.shape))].reshape(part.shape)

@@ -18,7 +18,7 @@ from ..mapping import ABSENT, PRESENT, SHORT, ChannelMapping
 from ..source import Channel, Report, ignore
 from ..units import declared_conversion, second_ns
 from ..worker_process import gist
-from .limits import Limits, span_of
+from .limits import SignalLimits, span_of
 from .readers import EXTENDED, BusName, Raw
 from .signals import extract, ordered, tabulate, vectorises
 
@@ -76,8 +76,8 @@ class Decoder:
         ]
         self._messages = [message for message, *_ in self._plans]
         self._names = [[signal.name for signal in signals] for signals in needed]
-        self._signals = tabulate(list(zip(self._messages, needed, strict=True)))
-        self._limits = Limits(list(zip(self._messages, needed, strict=True)), [own for *_, own in self._plans], report)
+        plans, own = list(zip(self._messages, needed, strict=True)), [own for *_, own in self._plans]
+        self._signals, self._limits = tabulate(plans), SignalLimits(plans, own, report)
         self._slow = np.array([not all(map(vectorises, signals)) for signals in needed], np.bool_)
         self._any_slow = bool(self._slow.any())
         self._most = max((len(signals) for signals in needed), default=1)

@@ -19,7 +19,7 @@ ERROR = re.compile(r"(signal|sensor|value|data)*(err|error|faulty?|failure)(indi
 state if all of its values are named."""
 
 
-class Limits:
+class SignalLimits:
     """Intervals of values that are missing, for each signal of each message.
 
     Limits of a DBC with max > min hold to half a step of the signal; those that are raw numbers, or beyond what its
