@@ -70,7 +70,7 @@ SERIAL_DATES = (36_526, 73_051)  # Days of the years 2000 to 2100 in Excel's cou
 class SignalSeries:
     """Values of one signal or column: times (ns) and finite values, (n,); `missing` counts the others.
 
-    Of a table whose rows are of several sources, `column` is the column, and `only` the column that names the source of
+    `column` is the column of a table whose rows are of several sources, and `only` the column that names the source of
     a row, with its name there.
     """
 

@@ -58,7 +58,7 @@ emit_signature = i64(
 def _own_variance(tables, r, values, state, i):
     """Return the noise variance of row r that frame i reports; NaN if it reports none, infinity if it is unknown.
 
-    Unknown is what is no number, is negative, as in messages of ROS, or is beyond any variance.
+    A value that is no number, negative, as in messages of ROS, or beyond any variance is unknown.
     """
     slot = tables.own_slot[r]
     own = tables.own_factor[r] * values[i, slot]

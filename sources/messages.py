@@ -160,7 +160,7 @@ class Messages:
         self.accepted = 0
         """Messages that were accepted."""
         self.mark = 0
-        """Of these, messages that were read."""
+        """Accepted messages that were read."""
         self._arrived = 0
         self._stores = False
         self.closed = False

@@ -1,8 +1,7 @@
 """Queue of filters that processes of their own compile into the cache.
 
-Numba compiles in one thread at a time and holds the interpreter meanwhile; beside the engine it would delay every
-measurement for half a minute. Requested filters come first, on several processors; all others that apply follow one
-after another, at the lowest priority, in the order of the catalogue.
+Numba compiles in one thread at a time and holds the interpreter, which would delay a measurement by half a minute.
+Requested filters come first, on several processors; the others follow in the catalogue's order, at lowest priority.
 """
 
 from __future__ import annotations

@@ -119,7 +119,7 @@ class ModelCode:
 
         Args:
             functions: The function of each sensor.
-            signature: Signature of what the addresses call.
+            signature: Signature of the functions at the addresses.
             own: Function that compiles that of sensor k.
             common: Function that compiles shared code, 0 if it cannot be.
         """

@@ -352,7 +352,7 @@ def coverage_bins(
 
 
 Subject = tuple[str, str, np.ndarray, np.ndarray]
-"""Name, role, rows (m,) and e (m,) of what has a band."""
+"""Name, role, rows (m,) and e (m,) of a quantity with a band."""
 
 
 def _sensor_rows(model: StateSpaceModel, events: Events, track: Track, marginal: bool) -> Iterator[Subject]:

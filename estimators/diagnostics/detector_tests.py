@@ -318,8 +318,8 @@ def resetting(own, std):
 def _contradicted(own, innovation, std, r, used, repeated):
     """Return whether the model or other sensors contradict that a row repeats its value.
 
-    Between two measurements the prediction moves by what the update before left of its innovation, (R/S) ν, less the
-    next innovation, as the measured value is the same. Its predicted variance is the growth of S - R meanwhile. A
+    Between two measurements the prediction moves by the residual after the earlier update, (R/S) ν, less the next
+    innovation, as the measured value is the same. Its predicted variance is the growth of S - R meanwhile. A
     movement contradicts the repetition if it exceeds quantum and noise, and is no sum of random steps. Without
     movement, repetition is improbable only if the change between two measurements is mostly noise.
     """

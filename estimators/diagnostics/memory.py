@@ -1,8 +1,8 @@
 """Are the corrections of a state too large over its own memory, and is one that was proved wrong corrected yet?
 
 An error of the model that lasts is taken up by small corrections of one sign, each inside its band, which the tests of
-single innovations cannot tell from chance (`detectors.py`); the estimate stays wrong by what the next corrections will
-add. Under the model each correction x⁺ - x⁻ of an optimal filter has covariance P⁻ - P⁺ and is uncorrelated with those
+single innovations cannot tell from chance (`detectors.py`); the estimate stays wrong by the corrections to come.
+Under the model each correction x⁺ - x⁻ of an optimal filter has covariance P⁻ - P⁺ and is uncorrelated with those
 before. Carried to the end of a time by the tangent F of the model,
 
     d ← F d + (x⁺ - x⁻),   D ← F D Fᵀ + (P⁻ - P⁺),   Φ ← F Φ,
@@ -236,8 +236,8 @@ def _hear(own, bit, innovation, std):
 def _weigh_proofs(context, own, state):
     """Find the states that have been proved wrong, and are not corrected yet.
 
-    Of a contradicted prior min(e, `MAX_Z`) of its deviations, d, were wrong, and measurements have left the share
-    ρ = P / (P + D) of them: ρ |d| > √P.
+    A contradicted prior was wrong by d, min(e, `MAX_Z`) of its deviations, and measurements have left the share
+    ρ = P / (P + D) of d: ρ |d| > √P.
 
     An impossible estimate may come back because the model moves it, which is no correction. If the true state was at
     the limit, it has moved as the model predicts. d is the estimate less that forecast, and as D begins with the row

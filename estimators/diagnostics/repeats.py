@@ -49,7 +49,7 @@ class RepeatFinding(NamedTuple):
     `kind` is HELD (a new value each `period`), STEPS or DEAD_BAND (constant between changes without a period), LINEAR
     (`period` is that of its knots, NaN without one), SINGLE (each row is a measurement) or UNDECIDED. `longest` is the
     longest that a value is held in one period, s; `share` is that of rows which repeat or interpolate, and `reason`
-    says it in words.
+    is the finding in words.
     """
 
     kind: str

@@ -15,7 +15,7 @@ batch, and its own fit explains that away; so J is taken as no less than its mea
 
     J = G^½ max(τ I, B) G^½,   B = G^-½ (Σ_batches s sᵀ) G^-½,   τ = max(1, tr B / k)
 
-With the prior N(0, D²), that of the data sheet, the covariance is (G J⁻¹ G + D⁻²)⁻¹: directions that the data do not
+Under the prior N(0, D²) of the data sheet, the covariance is (G J⁻¹ G + D⁻²)⁻¹: directions that the data do not
 determine keep their prior width. If p is not the minimum, the step to it, d = (G / τ + D⁻²)⁻¹ Σ s_t / τ, adds d dᵀ.
 
 That is the accuracy of common values. Of K recordings of one specimen each, with steps d_k and variances C_k of their

@@ -59,7 +59,7 @@ _PLAN = """
     degraded_after stale_after diverged_nis diverged_gated false_alarm_every silent_periods
 """.split()
 PLAN = np.dtype([(name, np.float64 if k > _PLAN.index("quantiles") else np.int64) for k, name in enumerate(_PLAN)])
-"""What the call reads: addresses and sizes; the last are limits of `HealthPolicy`."""
+"""Fields that the call reads: addresses and sizes; the last are limits of `HealthPolicy`."""
 
 CREW = (*Track._fields, "context", "r", "spare", "work", "score", "events_t", "kind", "channel", "events_value",
         "passed", "variances", "terms", "tail_t", "tail_place", "tail_value")  # fmt: skip
@@ -205,7 +205,7 @@ def _fold_share(place, crew):
     """Fold the new events of one thread's share of the assets.
 
     An asset stops after an event that asks for a decision on its sensor, and the share when no record is free for the
-    next asset; what is unfinished is folded by another call.
+    next asset; another call folds the rest.
     """
     plan = _plan_at(place)
     own = ints(plan.crew_places + 8 * crew * len(CREW), len(CREW))

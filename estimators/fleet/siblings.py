@@ -1,4 +1,4 @@
-"""Assets of one model beside each other: which differ from the others, and what a new one will be like."""
+"""Comparison of assets of one model: those that differ from the others, and the prior of a new one."""
 
 from __future__ import annotations
 

@@ -16,8 +16,8 @@ from ..track import DEGRADED, DIVERGED, HEALTH_NAMES, STALE
 class FleetTable(NamedTuple):
     """One row per asset, in the order of `Fleet.assets`.
 
-    seconds (N,): time of the last event, NaN before the first. since (N,): time of the event at which health became
-    what it is, s. mean, std (N, nx): the last estimate, in the units of the states. health (N,): index into
+    seconds (N,): time of the last event, NaN before the first. since (N,): time of the event that changed health
+    last, s. mean, std (N, nx): the last estimate, in the units of the states. health (N,): index into
     `HEALTH_NAMES`. cause (N,): name of the most severe detector in alarm, or "". age (N,): seconds since the last
     measurement, at the last event. verdict (N,): on the last event. nis_mean, nis_low, nis_high (N,): mean NIS over the
     last measurements and its 95 % bounds. events, stale (N,): events folded, and dropped as too late.

@@ -219,7 +219,7 @@ the sensor is accepted; the sensor passes the gate again."""
 class ReopeningEvidence(NamedTuple):
     """Evidence for the second fold: log-likelihood of the other sensors, number of measurements, own part (≤ 0).
 
-    possible: the evidence to expect of the others, ½ Σ Δν² / S of what the two folds predict of them.
+    possible: the evidence to expect of the others, ½ Σ Δν² / S of the two folds' predictions.
     """
 
     others: float

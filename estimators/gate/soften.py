@@ -2,7 +2,7 @@
 
     R ← w R,   w = 1 + (1/g - 1/NIS) νᵀ R⁻¹ ν,   NIS = νᵀ S⁻¹ ν > g
 
-With one row, or where ν is an eigenvector of S R⁻¹, NIS(w) is g exactly: 1/NIS is linear in w. With more rows 1/NIS is
+NIS(w) is g exactly for one row, or where ν is an eigenvector of S R⁻¹: 1/NIS is linear in w. With more rows 1/NIS is
 concave in w, and its slope nowhere less than 1 / νᵀ R⁻¹ ν, so NIS(w) is at most g. A measurement moves the estimate
 by about g/√NIS of the unsoftened update, the less the further off it is.
 

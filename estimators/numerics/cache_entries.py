@@ -58,7 +58,7 @@ class ContentLocator(caching._SourceFileBackedLocatorMixin, caching._CacheLocato
 
 
 class EntryFiles(caching.IndexDataCacheFile):  # type: ignore[misc]
-    """One file per entry, named by a digest of its key: two digests, of what it is for and of the rest, then the rest.
+    """One file per entry, named by a digest of its key: digests of its purpose and of the rest, then the rest.
 
     Numba numbers the files and keeps the numbers in an index. Of two processes that saved the code of two closures at
     once, one lost its entry, or was given the machine code of the other.

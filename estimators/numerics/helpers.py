@@ -55,8 +55,8 @@ def _with_helpers(function: Any, known: dict[Any, Any]) -> Any:
 def compiled(helper: Any, known: dict[Any, Any], forceinline: bool = False) -> Any:
     """Return a function compiled for compiled callers, under an identifier by which the cache finds them again.
 
-    Numba tells closures apart by what they hold, a compiled function by an identifier that is random by default: one
-    made from the source, and from what it encloses, finds the code that another process compiled.
+    Numba distinguishes closures by their content, a compiled function by an identifier that is random by default: one
+    made from the source, and from the values that it encloses, finds the code that another process compiled.
     """
     if helper not in known:
         # Registered first, so that a function that calls itself through its helpers does not recurse forever.

@@ -51,7 +51,7 @@ os.environ.setdefault("OMP_WAIT_POLICY", "passive")
 jit = partial(njit, cache=True, nogil=True, error_model="numpy", forceinline=False, no_cfunc_wrapper=True)
 """Numba's njit as used here: cached, without the GIL, and with IEEE division (zero divisors give inf, no error).
 
-Of the two wrappers that Numba compiles around each function, the one for C is left out, as nothing calls it. Where
+Numba compiles two wrappers around each function; the one for C is left out, as nothing calls it. Where
 `forceinline` is not given, a function has that of the caller which is compiled first: so a step's time depended on the
 order in which filters were compiled, by 15 %.
 """
@@ -96,7 +96,7 @@ def linkable(function: Callable[..., Any], forceinline: bool = False) -> Any:
 
 
 linkable_embedded = partial(linkable, forceinline=True)
-"""`linkable` for what each event needs, which is copied into its compiled callers, as with `embedded`."""
+"""`linkable` for functions that each event needs, copied into their compiled callers, as with `embedded`."""
 
 
 jit_brief = partial(njit, cache=True, error_model="numpy", forceinline=False, no_cfunc_wrapper=True)
@@ -139,7 +139,7 @@ embedded: Callable[[Callable[..., Any]], Any] = register_jitable(
 def named(made: Any) -> Any:
     """Give a compiled function of a module an identifier made from its name.
 
-    Numba tells closures apart by what they hold, a compiled function by its code and an identifier that is random in
+    Numba distinguishes closures by their content, a compiled function by its code and an identifier that is random in
     every process: code of a closure in which such a function occurs would never be found in the cache.
     """
     made._set_uuid(str(uuid5(NAMESPACE_OID, f"{made.py_func.__module__}.{made.py_func.__qualname__}")))

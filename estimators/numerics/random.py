@@ -32,7 +32,7 @@ _OTHER = np.uint64(0xD1B54A32D192ED03)
 _TO_UNIT = 2.0**-52
 
 _R = 3.6541528853610088
-"""Where the tail begins, for 256 layers of equal area (Marsaglia & Tsang, section 3)."""
+"""Start of the tail, for 256 layers of equal area (Marsaglia & Tsang, section 3)."""
 
 
 def _ziggurat() -> tuple[np.ndarray, np.ndarray, np.ndarray]:
@@ -71,7 +71,7 @@ def word(key, i):
 
 @jit
 def key_of(seed, index, stream):
-    """Where the sequence of (seed, event index, stream) starts."""
+    """Return the start of the sequence of (seed, event index, stream)."""
     key = mix(np.uint64(seed) + GAMMA)
     key = mix((key ^ np.uint64(index)) + GAMMA)
     return mix((key ^ np.uint64(stream)) + GAMMA)

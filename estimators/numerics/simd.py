@@ -118,7 +118,7 @@ def _combining(rows: int, subtract: bool = False) -> Any:
     def combine(v, count, weights, apart, x, stride, n, out, width):
         """out[i·width :][:n] = Σ_k weights[k·apart + i] x[k·stride :][:n], k < count, for i < rows: 1 or 4.
 
-        Where it subtracts, out loses the sum, term by term.
+        A subtraction takes the sum from out, term by term.
         """
 
         def write(v: Lanes, at: Any) -> None:

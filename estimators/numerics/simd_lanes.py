@@ -62,7 +62,7 @@ def _sums(v: Lanes, begin: Any, end: Any, terms: Callable[[Any], list[tuple[Any,
 def find_reflection(v, n, k, A, d, e, inverses):
     """Turn row k of A behind the diagonal into v, with I - inverses[k] v vᵀ the reflection that makes it e[k + 1] e₁.
 
-    Where the row is zero behind its first number, inverses[k] is 0.
+    inverses[k] is 0 for a row that is zero behind its first number.
     """
     builder, zero, one = v.builder, v.constant(0.0), v.constant(1.0)
     A, d, e, inverses = (LaneRows(v, array) for array in (A, d, e, inverses))

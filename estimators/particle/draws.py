@@ -160,7 +160,7 @@ def reconsider(context, index, state):
     of everything, mean and covariance of the other states, and their covariance with c, stay those of the weighted
     cloud: for a linear model they are those of Schmidt's filter (gaussian/shared.py). Particles that kept their c
     would lose the prior's spread with their weights; a filter for each c, mixed by the prior alone, would have no gain
-    that falls where measurements say more of c.
+    that falls where measurements determine c better.
 
     Sources: Schmidt (1966), for the moments; Liu & West (2001), doi:10.1007/978-1-4757-3437-9_10, for draws that
     restore the moments of constant states.

@@ -1,4 +1,4 @@
-// One dropped log: what it holds, its signals, the twins that fit, and a draft of a twin.
+// One dropped log: its content and signals, the twins that fit, and a draft of a twin.
 
 import { changed, element, setText, table } from "./dom.js";
 import { DATABASE } from "./drops.js";

@@ -54,7 +54,7 @@ export class Transport {
     new ResizeObserver(() => this.draw()).observe(this.canvas);
   }
 
-  // The width of what the charts show, also after a drag in a chart or a replay.
+  // The time span of the charts, also after a drag in a chart or a replay.
   showSpan() {
     const select = $("window");
     if (document.activeElement === select) return;
@@ -90,7 +90,7 @@ export class Transport {
     return this.ended && this.charts.range[0] <= this.extent[0] && this.extent[1] <= this.charts.range[1];
   }
 
-  // A replay is paused, and what has ended is played again; of a live source only the charts are held.
+  // A replay is paused, or played again after its end; of a live source only the charts are held.
   pause() {
     if (this.ended) this.replay(this.view.at ?? this.extent[0]);
     else if (this.status?.seekable) this.link.ask("Pause", { paused: !this.status.paused });

@@ -139,8 +139,7 @@ def _series(fold: Fold) -> Iterator[RowSeries]:
 def contradictions(fold: Fold) -> dict[str, str]:
     """Return why a fold cannot be a baseline, by sensor row: its noise is not that of R, or it changes within the log.
 
-    With the bias, scale and correlation of either half as baseline, the other half must raise no alarm of a shift that
-    is relevant.
+    Either half must raise no alarm of a relevant shift with the bias, scale and correlation of the other as baseline.
     """
     found: dict[str, str] = {}
     for series in _series(fold):

@@ -74,7 +74,7 @@ class JudgedRows(NamedTuple):
     stale_after: float = np.inf
 
     def measured(self, s: int) -> np.ndarray:
-        """Return the rows in which sensor s has a value: others tell nothing of it."""
+        """Return the rows in which sensor s has a value."""
         rows = self.events.of_sensor(s)
         return rows[self.track.verdict[rows] != MISSING]
 

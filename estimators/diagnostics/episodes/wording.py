@@ -135,7 +135,7 @@ class SensorFacts(EpisodeFacts):
 
     @property
     def held(self) -> str:
-        """Why a sensor repeats its value: it is stuck, or saturated at an end of what it can measure."""
+        """Why a sensor repeats its value: it is stuck, or saturated at an end of its measuring range."""
         limits = self.model.sensors[self.s].limits
         ends = (limits.range or limits.ends) if limits else ()
         return "saturated" if ends and np.isclose(ends[(self.k or 0) % len(ends)], self.size).any() else "stuck"

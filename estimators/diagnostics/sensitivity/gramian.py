@@ -9,7 +9,7 @@ so I - G is the covariance of that state after the measurements, as a share of t
 g of G give those of J, the stochastic observability Gramian: g / (1 - g). Exact for linear models, the derivative along
 the track for others.
 
-A state that forgets its beginning quickly (a lag, a disturbance that decays) is told nothing about by these
+A state that forgets its beginning quickly (a lag, a disturbance that decays) is not determined by these
 measurements, and needs not be: its prior is without effect. So the same nudges give Ψ = ∂x(T) / ∂x(0), how much of an
 error of the prior is left in the estimate at the end. A state is unobserved if neither determines it.
 
@@ -221,7 +221,7 @@ FORGOTTEN = "every state forgets its prior"
 def _response(begun: Sequence[Start], item: tuple[int, int]) -> tuple[np.ndarray, np.ndarray]:
     """Return the response of part k to one prior deviation of state j: `whitened` where used, and `states` at its end.
 
-    All of a `Response` would be most of what a process sends.
+    A whole `Response` would be most of the data that a process sends.
     """
     one, j = begun[item[0]], item[1]
     std = one.tuning.model.prior_std[j]

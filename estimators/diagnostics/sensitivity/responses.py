@@ -377,7 +377,7 @@ class Nudge(NamedTuple):
 
     @property
     def target(self) -> tuple[str, str]:
-        """What is at fault, sensor, input, parameter, prior, swap or noise, and its name."""
+        """Kind of the faulty part (sensor, input, parameter, prior, swap or noise) and its name."""
         if self.kind in (DRIFT, SCALE, DELAY, SPIKES, STUCK, R_):
             return SENSOR, self.name
         return (INPUT_ if self.kind in (INPUT_SCALE, INPUT_STUCK) else self.kind), self.name

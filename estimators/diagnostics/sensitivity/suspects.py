@@ -9,10 +9,9 @@ are its most likely size and its log-likelihood ratio against no fault. θ is th
 of a sensor or an input, or by how much the twin's parameter is too large. The parameter without this error must lie in
 its range.
 
-What the best fault leaves over, φ = Σ (ν - θ̂ Δν)² / n, is 1 if nothing else is wrong. Where it is larger, the model is
+The residual of the best fault, φ = Σ (ν - θ̂ Δν)² / n, is 1 if nothing else is wrong. Where it is larger, the model is
 not exact either, and log Λ / φ takes its place (quasi-likelihood). Faults are reported together with their odds, the
-exponentials of that, if these are close; and none, if the best explains only a small part of what is to be explained,
-Σ ν² - n.
+exponentials of that, if these are close; and none, if the best explains only a small part of the excess Σ ν² - n.
 
 Sources: Willsky & Jones (1976), doi:10.1109/TAC.1976.1101146, the generalised likelihood ratio of additive faults;
 McCullagh & Nelder (1989), Generalized Linear Models, chapter 9, for the division by φ.

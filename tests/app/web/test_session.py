@@ -34,11 +34,7 @@ def test_free_blocks_between_used_ones_are_returned(monkeypatch):
 
 
 def test_the_address_of_a_page_is_that_of_its_proxy_or_service():
-    pages = (
-        session.Page(0, False),
-        session.Page(0, False, public="https://a.example"),
-        session.Page(0, False, site="x/y"),
-    )
+    pages = [session.Page(0, False, **named) for named in ({}, {"public": "https://a.example"}, {"site": "x/y"})]
     servers = [session.Session(None, page=page).http_server for page in pages]
     own = f"http://127.0.0.1:{servers[0].port}"
     assert [server.site for server in servers] == [own, "https://a.example", "x/y"]
