@@ -146,7 +146,8 @@ def test_a_wrong_file_is_one_line(before, after, line, tmp_path, capsys):
 def test_a_live_source_without_measurements_is_told_from_wrong_channels(tmp_path, capsys):
     (tmp_path / "pumps.yaml").write_text("twin: motor_winding\nsource: {type: push}\n")
     assert main(["fleet", "pumps.yaml", "--headless", "--duration", "0.01"]) == 2
-    assert capsys.readouterr().err == "nisus: pumps.yaml:2: no measurement arrived; check that its senders run\n"
+    told = [line for line in capsys.readouterr().err.splitlines() if not line.startswith("compil")]
+    assert told == ["nisus: pumps.yaml:2: no measurement arrived; check that its senders run"]
 
 
 def test_open_alerts_of_a_fleet_are_kept_in_its_store(tmp_path, capsys):
