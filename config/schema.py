@@ -179,7 +179,7 @@ class SensorSection(SpreadSection, InstrumentSection):
     """Noise of one sensor as the estimator assumes it, limits of its measurements, and whether they are used."""
 
     error: ErrorSection | None = None
-    """A coloured error beside the white noise: {std: 3, over: 5 min}. A state is appended for each row,
+    """A coloured error beside the white noise: {std: 3, correlation_time: 5 min}. A state is appended for each row,
     SENSOR_error (SENSOR_ROW_error of several rows), and the parameter SENSOR_error_time. Default: none."""
     correlation: tuple[tuple[Number, ...], ...] | None = None
     """Correlation of the noise of its rows, for example [[1, 0.5], [0.5, 1]], with R_ij = correlation_ij √(R_ii R_jj):

@@ -17,7 +17,7 @@ from estimators.model.state_space import LARGE
 from estimators.registry import find_entry
 from estimators.track import Track
 
-from ..engine.copies import MAX_PULL_ROWS, EventWindow, Status
+from ..engine.copies import EventWindow, Status
 from ..engine.fault_monitors import reason_against
 from ..engine.jobs import Job, PacedExecutor
 from ..engine.running_fold import Running
@@ -119,7 +119,9 @@ class Diagnosis:
     def _look(self) -> dict[str, Any]:
         engine = self._engine
         tuning, estimator = engine.folded_with()
-        revision, events, track = last_rows(engine, DIAGNOSED_ROWS)
+        end = engine.end()
+        pull = engine.rows(end - DIAGNOSED_ROWS, end)
+        revision, events, track = pull.revision, pull.events, pull.track
         status = engine.status()
         marginal = find_entry(estimator).marginal
         slow = self._figures.of(revision) if len(events) else None
@@ -144,23 +146,6 @@ class Diagnosis:
             "cost": None if slow is None else number(slow.cost, 3),
             **_unseen(status),
         }
-
-
-def last_rows(engine: Running, most: int) -> tuple[int, Events, Track]:
-    """Copy the last rows of one revision; return its number, events and track.
-
-    Copied in chunks, so that the engine never waits for long; a late measurement in between may show in one only.
-    """
-    end = engine.end()
-    pieces = [engine.rows(end - most, end - most)]
-    for start in range(max(0, end - most), end, MAX_PULL_ROWS):
-        piece = engine.rows(start, min(start + MAX_PULL_ROWS, end))
-        if piece.revision != pieces[0].revision:
-            return last_rows(engine, most)
-        pieces.append(piece)
-    events = Events.concat([piece.events for piece in pieces], engine.model.width)
-    track = Track(*(np.concatenate(columns) for columns in zip(*(piece.track for piece in pieces), strict=True)))
-    return pieces[0].revision, events, track
 
 
 def _agreed(rows: list[dict[str, Any]], status: Status) -> list[dict[str, Any]]:

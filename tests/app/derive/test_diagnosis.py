@@ -9,7 +9,8 @@ import pytest
 from scipy.signal import lfilter
 from scipy.stats import norm
 
-from app.derive.diagnosis import Diagnosis, _agreed, last_rows
+from app.derive import diagnosis
+from app.derive.diagnosis import Diagnosis, _agreed
 from app.derive.row_figures import LAGS, rows_json, verdict
 from app.engine.commands import SetEstimator
 from estimators.diagnostics.detector_state import no_baseline
@@ -126,15 +127,10 @@ def test_a_sensor_in_doubt_is_not_called_consistent():
     assert _agreed(rows, doubt)[0]["verdict"] == "y: y spikes" and rows[0]["tone"] == "bad"
 
 
-def test_only_the_last_rows_are_looked_at():
-    stepped = Stepped()
-    engine = stepped.engine
-    events = consistent(9000)
-    stepped.put(events)
-    revision, rows, track = last_rows(engine, 5000)
-    assert revision == 0 and len(rows) == len(track) == 5000
-    np.testing.assert_array_equal(rows.t, events.t[-5000:])
-    np.testing.assert_array_equal(track.mean, pull_all(engine).track.mean[-5000:])
+def test_only_the_last_rows_are_looked_at(monkeypatch):
+    monkeypatch.setattr(diagnosis, "DIAGNOSED_ROWS", 5000)
+    _, said = looked(events := consistent(9000))
+    assert (said["events"], said["span"]) == (5000, float(events.t[-1] - events.t[-5000]) * 1e-9)
 
 
 def test_nothing_is_said_before_the_first_reading():
