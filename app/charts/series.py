@@ -5,9 +5,11 @@ from __future__ import annotations
 import threading
 from collections.abc import Iterable
 
+from sources.source import span_of
+
 from ..columns import columns_of
 from ..derive.background_folds import PinnedFold, Smoother
-from ..engine.running_fold import Running
+from ..engine.engine import Engine
 from .chart_stream import ChartStream
 from .charted_run import ChartedRun, KeptRows, RowSource
 
@@ -20,7 +22,7 @@ DIFFERENCE = "difference:"
 class Series:
     """Frames for the chart streams of all browsers. Thread-safe."""
 
-    def __init__(self, engine: Running) -> None:
+    def __init__(self, engine: Engine) -> None:
         self._engine = engine
         self.columns = columns_of(engine.model)
         self.streams: set[ChartStream] = set()
@@ -37,7 +39,7 @@ class Series:
 
         None before the first event.
         """
-        span = self._engine.status().span
+        span = span_of(self._engine.source)
         first, newest = self._engine.span() if span is None else span
         if newest and (self._origin is None or span is not None or newest < self._origin):
             self._origin = first
