@@ -4,12 +4,12 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping
 from functools import partial
-from typing import Any, Literal
+from typing import Literal
 
 from sources import formats
 
 
-def _added(kind: Literal["tables", "folders"]) -> Mapping[str, Callable[[], Any]]:
+def _added(kind: Literal["tables", "folders"]) -> Mapping[str, Callable[[], object]]:
     from config.extensions import maker, registered
 
     return {name: partial(maker, kind, name) for name in registered(kind)}

@@ -18,6 +18,9 @@ WORSE = "worse than no filter"
 Cell: TypeAlias = str | float | None
 """Content of a table cell; None and NaN mean that there is no value."""
 
+JsonObject: TypeAlias = dict[str, Any]
+"""Object of JSON: text, numbers, lists and objects by name."""
+
 
 class TableColumn(NamedTuple):
     """Heading of a table column, and the format of its numbers.
@@ -120,7 +123,7 @@ def finite_text(value: float) -> str:
     return digits(value) if np.isfinite(value) else "-"
 
 
-def plain(value: Any, *, infinity_text: bool = False) -> Any:
+def plain(value: object, *, infinity_text: bool = False) -> Any:
     """Return a copy that JSON can hold.
 
     Named tuples and dataclasses become objects, arrays and tuples lists, NaN null, and infinity null or "inf".
@@ -140,6 +143,6 @@ def plain(value: Any, *, infinity_text: bool = False) -> Any:
     return value
 
 
-def to_json(value: Any) -> str:
+def to_json(value: object) -> str:
     """Return any nest of results as one line of strict JSON; see `plain`."""
     return json.dumps(plain(value), allow_nan=False)

@@ -41,7 +41,7 @@ class EndRequest:
         return True
 
 
-def when_asked_to_end(end: Callable[[], Any]) -> Mapping[int, Any]:
+def when_asked_to_end(end: Callable[[], object]) -> Mapping[int, Any]:
     """Call `end`, which must take no lock, when one of them comes; gives what handled them before.
 
     One that is ignored stays so: who started the program with `nohup` wants it to outlive the terminal.
@@ -55,7 +55,7 @@ def when_asked_to_end(end: Callable[[], Any]) -> Mapping[int, Any]:
 
 
 @contextmanager
-def until_asked_to_end(stop: Callable[[], Any] = lambda: None) -> Iterator[EndRequest]:
+def until_asked_to_end(stop: Callable[[], object] = lambda: None) -> Iterator[EndRequest]:
     """Context manager: yield the request to end; Ctrl-C ends the block, too. `stop` is called at its end, in any case.
 
     After `stop` the signals are handled as before.
@@ -108,7 +108,7 @@ def messages_file() -> TextIO:
     return cast(TextIO, JsonLines()) if _lines_of_json else sys.stderr
 
 
-def print_line(level: str, text: object, **fields: Any) -> None:
+def print_line(level: str, text: object, **fields: object) -> None:
     """Print a line of a log on standard error, with the present time (UTC); `fields` are added to one of JSON."""
     now = datetime.now(UTC).isoformat(timespec="milliseconds")
     if _lines_of_json:

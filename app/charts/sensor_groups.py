@@ -6,11 +6,12 @@ import re
 from collections import Counter
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
 
 from estimators.model.state_space import StateSpaceModel
+
+from ..result import JsonObject
 
 MANY_SENSORS = 24
 """Sensors without a family from which on they are grouped by the letters before the first digit of their names."""
@@ -56,16 +57,14 @@ def sensor_groups(model: StateSpaceModel) -> tuple[SensorGroup, ...]:
     )
 
 
-def groups_json(
-    groups: Sequence[SensorGroup], sensors: Mapping[str, tuple[str, str]], nis: np.ndarray
-) -> dict[str, Any]:
+def groups_json(groups: Sequence[SensorGroup], sensors: Mapping[str, tuple[str, str]], nis: np.ndarray) -> JsonObject:
     """Return the summary of each group: number of sensors by state, mean NIS per degree of freedom, worst members.
 
     `sensors` has state and text of every sensor, in the model's order; `nis` the mean of its recent measurements per
     degree of freedom, NaN without any.
     """
     names, states = list(sensors), [state for state, _ in sensors.values()]
-    found: dict[str, Any] = {}
+    found: JsonObject = {}
     if len(nis) != len(names):  # before the first event
         nis = np.full(len(names), np.nan)
     for group in groups:

@@ -5,7 +5,6 @@ from __future__ import annotations
 import math
 import time
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
 
 from config.loader import moved, shipped
 from config.old_names import rewrite
@@ -15,7 +14,7 @@ from sources.formats import is_whole
 
 from ..format_time import counted
 from ..render.text import to_text
-from ..result import TableColumn, Topic, to_json
+from ..result import JsonObject, TableColumn, Topic, to_json
 from ..study.advice.draft import check_new, hint_lines, write_draft
 from ..study.advice.measured import AdviceProgress, Measured, digits, percent, seconds_text, without_faults
 from ..study.advice.plan import DraftPlan, Moves, plan, redundant, unit_ratio
@@ -25,13 +24,11 @@ from ..study.advice.verdict import Advice, advice_json, changed, details, exclus
 from ..study.advice.verdict import advise as recommend
 from ..twin.log_reader import read_log
 from ..twin.twin import Twin, load_twin
+from .arguments import AdviseCommand as Arguments
 from .log import contents_of, databases_of
 from .new import fit_draft, report_draft, roles_json
 from .options import check_output, overrides_of, roles_of
 from .prepare import attend, prepare
-
-if TYPE_CHECKING:
-    from .arguments import AdviseCommand as Arguments
 
 MAX_LISTED_SIGNALS = 40
 
@@ -208,7 +205,7 @@ def _state_text(item: Moves) -> str:
     return f"{item.name}: {moves}; Q {digits(item.q)} per second; {r}"
 
 
-def _draft_json(every: list[Signal], drafted: DraftPlan) -> dict[str, Any]:
+def _draft_json(every: list[Signal], drafted: DraftPlan) -> JsonObject:
     """Return `signals`, `pairs`, `states` and `inputs` for scripts."""
     names = [one.name for one in drafted.signals]
     return {

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
-
 from config.yaml_files import writing
 
 from ..render.html import to_html
@@ -14,10 +12,8 @@ from ..study.checklist import checklist
 from ..study.processes import executor_of
 from ..twin.log_reader import read_log
 from ..twin.twin import with_held
+from .arguments import CheckCommand as Arguments
 from .prepare import attend, overrides_of, prepared
-
-if TYPE_CHECKING:
-    from .arguments import CheckCommand as Arguments
 
 
 def check_twin(arguments: Arguments) -> int:

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
-
 from estimators.diagnostics.calibration import WHOLE
 from estimators.diagnostics.detector_tests import COVERED
 from estimators.diagnostics.episodes import episodes
@@ -16,10 +14,8 @@ from ..study.commission import baseline_of, lines, store_baseline
 from ..study.fold_result import coverage_of
 from ..terminal import complain
 from ..twin.log_reader import read_log
+from .arguments import CommissionCommand as Arguments
 from .prepare import prepared
-
-if TYPE_CHECKING:
-    from .arguments import CommissionCommand as Arguments
 
 
 def commission_twin(arguments: Arguments) -> int:

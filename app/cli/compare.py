@@ -2,22 +2,18 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Any
-
 from config.loader import shipped
 from estimators.errors import ConfigError, SourceError
 
-from ..result import to_json
+from ..result import JsonObject, to_json
 from ..study.compare import applicable, best_text, compare, without_marks
 from ..study.scores import FilterScore, cells, printed, row_json, write_scores
 from ..terminal import complain
 from ..twin.log_reader import read_logs
 from ..twin.twin import load_twin
+from .arguments import CompareCommand as Arguments
 from .options import overrides_of, span_of
 from .prepare import prepare, progress
-
-if TYPE_CHECKING:
-    from .arguments import CompareCommand as Arguments
 
 ALL = "all"  # name that stands for every bundled twin
 
@@ -30,7 +26,7 @@ def compare_twin(arguments: Arguments) -> int:
             print(to_json(rows))
         return 0
     failed = 0
-    found: dict[str, list[dict[str, Any]]] = {}
+    found: dict[str, list[JsonObject]] = {}
     for name in shipped():
         try:
             found[name] = _compare(arguments, name)
@@ -42,7 +38,7 @@ def compare_twin(arguments: Arguments) -> int:
     return failed
 
 
-def _compare(arguments: Arguments, name: str) -> list[dict[str, Any]]:
+def _compare(arguments: Arguments, name: str) -> list[JsonObject]:
     """Print the table of a twin, unless JSON is wanted, and return its rows for scripts."""
     overrides = overrides_of(arguments)
     twin = load_twin(name, log_files=arguments.log or None, overrides=overrides)

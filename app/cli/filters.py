@@ -5,7 +5,6 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import dataclass
 from functools import partial
-from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
@@ -16,14 +15,12 @@ from estimators.log import READING
 from estimators.registry import ESTIMATORS, unfit
 
 from ..render.text import to_text
-from ..result import Figure, TableColumn, Topic, to_json
+from ..result import Figure, JsonObject, TableColumn, Topic, to_json
 from ..study.advice.measured import bytes_text
 from ..twin.log_reader import read_log
 from ..twin.twin import Twin, load_twin
+from .arguments import FiltersCommand as Arguments
 from .prepare import attend
-
-if TYPE_CHECKING:
-    from .arguments import FiltersCommand as Arguments
 
 SAMPLE_S = (60.0, 3.2e7)  # seconds of a twin's source from which its rate is taken, the first that have enough readings
 MIN_SAMPLE = 10
@@ -48,7 +45,7 @@ def show_filters(arguments: Arguments) -> int:
     return 0
 
 
-def catalogue_json(shown: Mapping[str, Estimator] = ESTIMATORS) -> list[dict[str, Any]]:
+def catalogue_json(shown: Mapping[str, Estimator] = ESTIMATORS) -> list[JsonObject]:
     """Return estimators for scripts."""
     words = ("name", "family", "title", "assumes", "model_runs", "fails_when", "source", "options")
     return [{word: getattr(entry, word) for word in words} for entry in shown.values()]

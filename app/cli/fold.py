@@ -6,12 +6,13 @@ import os
 import time
 from collections.abc import Callable
 from pathlib import Path
-from typing import TYPE_CHECKING
 
 from config.extensions import left_out, maker, registered
 from config.yaml_files import writing
+from estimators.diagnostics.episodes import Episode
 from estimators.errors import ConfigError
 from estimators.registry import find_estimator
+from estimators.smoothing.walk import Smoothed
 
 from ..record.rrd_file import TAKEN
 from ..render.text import to_text
@@ -19,14 +20,9 @@ from ..result import to_json
 from ..study.fold_result import FoldResult, fold_json, fold_topics, known_states, pairs_with, rows_of, with_covariance
 from ..study.scores import pictures_of
 from ..twin.log_reader import read_log
+from .arguments import FoldCommand as Arguments
 from .options import span_of
 from .prepare import attend, fold_log, opened, prepare
-
-if TYPE_CHECKING:
-    from estimators.diagnostics.episodes import Episode
-    from estimators.smoothing.walk import Smoothed
-
-    from .arguments import FoldCommand as Arguments
 
 
 def fold_twin(arguments: Arguments) -> int:

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
 from zoneinfo import available_timezones
 
 import numpy as np
@@ -26,14 +25,12 @@ from sources.tables.times import SERIAL_DAYS, UNITS, TimeColumn
 
 from ..format_time import FIRST_DATED_NS, duration_text, format_time
 from ..render.text import to_text
-from ..result import Cell, TableColumn, Topic, to_json
+from ..result import Cell, JsonObject, TableColumn, Topic, to_json
 from ..study.advice.draft import undecided_lines
 from ..study.advice.signals import rate_of, signals
 from ..terminal import complain
-
-if TYPE_CHECKING:
-    from .arguments import LogCommand as Arguments
-    from .arguments import TableOptions
+from .arguments import LogCommand as Arguments
+from .arguments import TableOptions
 
 MAX_LISTED = 5  # gaps and faults that are listed; the others are counted
 
@@ -189,10 +186,10 @@ def _series_cells(series: SignalSeries, start: int) -> tuple[Cell, ...]:
     return *_time_cells(series.t, start), low, high
 
 
-def _as_dict(found: RecordingContents) -> dict[str, Any]:
+def _as_dict(found: RecordingContents) -> JsonObject:
     if found.parts:
         return {"kind": found.kind, "parts": [_as_dict(part) for part in found.parts]}
-    content: dict[str, Any] = (
+    content: JsonObject = (
         {"messages": [_message(message) for message in found.messages]}
         if found.kind == "can_log"
         else {"time": found.time.name, "columns": [_series(series) for series in found.columns]}
@@ -209,7 +206,7 @@ def _as_dict(found: RecordingContents) -> dict[str, Any]:
     }
 
 
-def _message(message: Message) -> dict[str, Any]:
+def _message(message: Message) -> JsonObject:
     return {
         "bus": message.bus,
         "id": message.key & ~EXTENDED,
@@ -220,7 +217,7 @@ def _message(message: Message) -> dict[str, Any]:
     }
 
 
-def _span(t: np.ndarray) -> dict[str, Any]:
+def _span(t: np.ndarray) -> JsonObject:
     return {
         "number": int(t.size),
         "rate": rate_of(t),
@@ -230,7 +227,7 @@ def _span(t: np.ndarray) -> dict[str, Any]:
     }
 
 
-def _series(series: SignalSeries) -> dict[str, Any]:
+def _series(series: SignalSeries) -> JsonObject:
     known, repeats = series.values.size > 0, find_repeats(series.t, series.values)
     return {
         "name": series.name,

@@ -17,6 +17,7 @@ import sys
 import warnings
 from collections.abc import Sequence
 from pathlib import Path
+from types import ModuleType
 from typing import Annotated, Any
 
 import tyro
@@ -49,7 +50,7 @@ class Complaints(logging.Handler):
 FULL = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG, errno.EIO)  # errors of a device that takes no more output
 
 
-def carry_out(command: Any) -> int:
+def carry_out(command: object) -> int:
     """Run one command; only its own module is imported, so that `nisus twins` answers at once."""
     if getattr(command, "log_format", None) == "json":
         use_lines_of_json()
@@ -57,7 +58,7 @@ def carry_out(command: Any) -> int:
         name = next(name for name, options in schemas("commands").items() if options is type(command))
         return int(maker("commands", name)(command))
     module, _, function = COMMANDS[type(command)].partition(":")
-    workers: tuple[Any, ...] = ()
+    workers: tuple[object, ...] = ()
     if isinstance(command, RunCommand) and command.twin is not None and not command.headless:
         from ..engine.compilers import first_compilers
 
@@ -65,7 +66,7 @@ def carry_out(command: Any) -> int:
     return int(getattr(_imported(f"{__package__}.{module}"), function)(command, *workers))
 
 
-def _imported(name: str) -> Any:
+def _imported(name: str) -> ModuleType:
     """Import a module without a search for garbage, which takes a sixth of the time, and then exempt what it made."""
     if name not in sys.modules:
         gc.disable()
@@ -77,7 +78,7 @@ def _imported(name: str) -> Any:
     return sys.modules[name]
 
 
-def parse(arguments: Sequence[str]) -> Any:
+def parse(arguments: Sequence[str]) -> object:
     """Return the command that the arguments name, or exit with its help or the script of a shell.
 
     Raises:
@@ -139,7 +140,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
         return 2
 
 
-def _show_warning(message: object, category: type, filename: str, lineno: int, *_: Any, **__: Any) -> None:
+def _show_warning(message: object, category: type, filename: str, lineno: int, *_: object, **__: object) -> None:
     """Print a warning in one line; none of arithmetic, whose results are checked and shown as missing or failed."""
     if not issubclass(category, RuntimeWarning):
         complain(f"{shown_path(Path(filename))}:{lineno}: {message}")

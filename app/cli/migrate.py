@@ -2,19 +2,15 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Any
-
 from config.loader import find
 from config.old_names import read_yaml, rewrite
 from config.tunings import version_files
 from config.yaml_files import read_text, shown_path
 from estimators.errors import ConfigError
 
-from ..result import to_json
+from ..result import JsonObject, to_json
 from ..terminal import complain
-
-if TYPE_CHECKING:
-    from .arguments import MigrateCommand as Arguments
+from .arguments import MigrateCommand as Arguments
 
 
 def migrate(arguments: Arguments) -> int:
@@ -22,7 +18,7 @@ def migrate(arguments: Arguments) -> int:
     if not arguments.files:
         raise ConfigError("no file is named; give at least one")
     twins = [find(name) for name in arguments.files]
-    files: list[dict[str, Any]] = []
+    files: list[JsonObject] = []
     status = 0
     for path in dict.fromkeys(file for twin in twins for file in (twin, *version_files(twin).values())):
         name = shown_path(path)

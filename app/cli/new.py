@@ -4,12 +4,12 @@ from __future__ import annotations
 
 from pathlib import Path
 from textwrap import shorten
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 from config.yaml_files import writing
 from estimators.errors import ConfigError
 
-from ..result import to_json
+from ..result import JsonObject, to_json
 from .options import roles_of
 
 if TYPE_CHECKING:
@@ -150,7 +150,7 @@ def fit_draft(drafted: DraftPlan) -> DraftPlan:
     return found
 
 
-def roles_json(drafted: DraftPlan) -> dict[str, Any]:
+def roles_json(drafted: DraftPlan) -> JsonObject:
     """Return the role of every signal, and the check of a fitted draft, for scripts."""
     check = drafted.check
     sensors = [

@@ -145,7 +145,7 @@ def moment_of(option: str, text: str, events: Events) -> int:
     return round((when if when.tzinfo else when.replace(tzinfo=UTC)).timestamp()) * 10**9
 
 
-def options_of(command: type) -> dict[str, Any]:
+def options_of(command: type) -> dict[str, object]:
     """Return the types of a command's options, by field; positional arguments are left out."""
     hints = get_type_hints(command, include_extras=True)
     hints = {field.name: hints[field.name] for field in dataclasses.fields(command)}

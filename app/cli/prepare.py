@@ -6,7 +6,7 @@ import time
 from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import Future, wait
 from contextlib import contextmanager
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, TypeVar
 
 import numpy as np
 
@@ -27,6 +27,8 @@ from .options import overrides_of
 if TYPE_CHECKING:
     from rich.console import Console
 
+T = TypeVar("T")
+
 STATUS_DELAY_S = 1.0  # seconds before the line appears; loading from the cache takes less
 
 
@@ -46,7 +48,7 @@ def prepared(arguments: Any, **others: str) -> Twin:
     return twin
 
 
-def fold_log(twin: Twin, log: Log, *, picture: Any = None, pairs: np.ndarray | None = None) -> Fold:
+def fold_log(twin: Twin, log: Log, *, picture: float | None = None, pairs: np.ndarray | None = None) -> Fold:
     """Fold a log to its end, so that Ctrl-C ends even a model function that does not return.
 
     Args:
@@ -118,13 +120,13 @@ def begin_to_compile(twin: Twin, workers: Sequence[Compiler] = ()) -> CompileQue
 
 def attend(
     model: StateSpaceModel | None,
-    work: Callable[[], Any],
+    work: Callable[[], T],
     doing: str,
     done: str | None = None,
     *,
     text: Callable[[], str] = str,
-    stop: Callable[[], Any] | None = None,
-) -> Any:
+    stop: Callable[[], object] | None = None,
+) -> T:
     """Do work that runs a model, in a thread that may be left behind, so that Ctrl-C ends even a call without end.
 
     Args:
@@ -162,7 +164,7 @@ def attend(
     return over.result()
 
 
-def _watch(over: Future[Any], watch: CallWatch | None, text: Callable[[], str], first: str) -> None:
+def _watch(over: Future[T], watch: CallWatch | None, text: Callable[[], str], first: str) -> None:
     """Show what a thread does until it is over, and name a function of the model that does not return."""
     console = _console()
     with _shown(text, console, first):
@@ -195,7 +197,7 @@ def _shown(text: Callable[[], str], console: Console, first: str = "") -> Iterat
 
 
 @contextmanager
-def _every(seconds: float, call: Callable[[], Any]) -> Iterator[None]:
+def _every(seconds: float, call: Callable[[], object]) -> Iterator[None]:
     """Call a function at intervals, in a thread of its own."""
 
     def run() -> None:

@@ -8,7 +8,7 @@ from collections.abc import Callable, Sequence
 from concurrent.futures import Executor
 from contextlib import AbstractContextManager
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 from config.loader import find
 from config.yaml_files import shown_path, writing
@@ -32,11 +32,9 @@ from ..twin.log_reader import read_log, read_logs
 from ..twin.tuning_yaml import tuning_yaml
 from ..twin.twin import Twin, load_twin, with_held
 from ..twin.versions import apply_tuning, check_free, keep, settings_of, version_text, widths_of
+from .arguments import TuneCommand as Arguments
 from .options import check_output, names_of, overrides_of, seconds_of, span_of
 from .prepare import attend, fold_log, prepare
-
-if TYPE_CHECKING:
-    from .arguments import TuneCommand as Arguments
 
 MIN_BLOCKS = 3  # least number of blocks, of which one is held out
 
@@ -106,7 +104,7 @@ def _executor(arguments: Arguments, twin: Twin, held: Twin) -> AbstractContextMa
 
 
 def _attend_fit(
-    twin: Twin, work: Callable[[], Any], state: FitProgress, doing: str, text: Callable[[], str] = str
+    twin: Twin, work: Callable[[], object], state: FitProgress, doing: str, text: Callable[[], str] = str
 ) -> Any:
     """Run a fit with its progress; Ctrl-C ends it with the best values so far."""
 

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Any
-
 import numpy as np
 
 from config.tunings import OWN_VALUES
@@ -12,7 +10,7 @@ from estimators.diagnostics.score import score
 from estimators.errors import ConfigError, printable
 
 from ..render.text import to_text
-from ..result import TableColumn, Topic, to_json
+from ..result import JsonObject, TableColumn, Topic, to_json
 from ..study.scores import pictures_of
 from ..twin.changes import difference, value_text
 from ..twin.log_reader import read_log
@@ -31,10 +29,8 @@ from ..twin.versions import (
     listing,
     version_text,
 )
+from .arguments import TuningsCommand as Arguments
 from .prepare import fold_log, prepared
-
-if TYPE_CHECKING:
-    from .arguments import TuningsCommand as Arguments
 
 SCORE_TITLES = {NIS: "NIS / dof", LIKELIHOOD: "log L per measurement", REFUSED: "share rejected"}
 
@@ -87,7 +83,7 @@ def _apply(arguments: Arguments, name: str) -> None:
     _print(arguments, text, name=name, applied=str(twin.path))
 
 
-def _print(arguments: Arguments, text: str, **result: Any) -> None:
+def _print(arguments: Arguments, text: str, **result: object) -> None:
     print(to_json(result) if arguments.json else text)
 
 
@@ -124,7 +120,7 @@ def _mean_coverage(scores: dict[str, float]) -> float | None:
     return sum(covered) / len(covered) if covered else None
 
 
-def _note(item: dict[str, Any]) -> str:
+def _note(item: JsonObject) -> str:
     if item["name"] == OWN_VALUES:
         return "the twin's file"
     accepted = item["accepted"]

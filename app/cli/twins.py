@@ -3,9 +3,11 @@
 from __future__ import annotations
 
 from itertools import takewhile
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 from config.yaml_files import TWINS, parse, read_text, shipped, shown_path
+
+from ..result import JsonObject
 
 if TYPE_CHECKING:
     from config.loader import Loaded
@@ -39,7 +41,7 @@ def show_twins(arguments: Arguments) -> int:
     return 0
 
 
-def _head(loaded: Loaded) -> dict[str, Any]:
+def _head(loaded: Loaded) -> JsonObject:
     from config.model_schema import model_file
 
     config = loaded.config
@@ -53,7 +55,7 @@ def _head(loaded: Loaded) -> dict[str, Any]:
     }
 
 
-def _json(loaded: Loaded) -> dict[str, Any]:
+def _json(loaded: Loaded) -> JsonObject:
     """Return head, leading comment of the YAML, and scores: figures as numbers, texts as they are."""
     from ..study.scores import read_scores
 

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
-
 import numpy as np
 
 from estimators.attribution import Attribution, attribution
@@ -13,11 +11,9 @@ from ..render.text import to_text
 from ..result import to_json
 from ..study.why import why_json, why_topics
 from ..twin.log_reader import read_log
+from .arguments import WhyCommand as Arguments
 from .options import moment_of
 from .prepare import attend, prepared
-
-if TYPE_CHECKING:
-    from .arguments import WhyCommand as Arguments
 
 MAX_COLUMNS = 4  # states in a table; --state names others
 

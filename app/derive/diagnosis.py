@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import time
 from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
 
@@ -21,6 +20,7 @@ from ..engine.copies import EventWindow, Status
 from ..engine.fault_monitors import reason_against
 from ..engine.jobs import Job, PacedExecutor
 from ..engine.running_fold import Running
+from ..result import JsonObject
 from .row_figures import listed, number, rows_json
 
 DIAGNOSED_ROWS = 20_000  # last rows that are analysed
@@ -99,9 +99,9 @@ class Diagnosis:
 
     def __init__(self, engine: Running) -> None:
         self._engine, self._figures = engine, FoldFigureCache(engine)
-        self._known: tuple[float, dict[str, Any]] | None = None
+        self._known: tuple[float, JsonObject] | None = None
 
-    def figures(self) -> dict[str, Any]:
+    def figures(self) -> JsonObject:
         """Return the figures of the last rows, at most `REUSE_S` seconds old.
 
         `rows` are the first of the sensors' rows (row_figures.py), `rows_in_all` how many there are, `ranks` counts of
@@ -116,7 +116,7 @@ class Diagnosis:
             self._known = known = time.monotonic(), answer
         return known[1]
 
-    def _look(self) -> dict[str, Any]:
+    def _look(self) -> JsonObject:
         engine = self._engine
         tuning, estimator = engine.folded_with()
         end = engine.end()
@@ -148,7 +148,7 @@ class Diagnosis:
         }
 
 
-def _agreed(rows: list[dict[str, Any]], status: Status) -> list[dict[str, Any]]:
+def _agreed(rows: list[JsonObject], status: Status) -> list[JsonObject]:
     """Return the rows; none is called good while the detectors report an episode about it."""
     for row in rows:
         state, text = status.sensors.get(row["sensor"], ("", ""))
@@ -157,7 +157,7 @@ def _agreed(rows: list[dict[str, Any]], status: Status) -> list[dict[str, Any]]:
     return rows
 
 
-def _ranks(status: Status) -> dict[str, Any] | None:
+def _ranks(status: Status) -> JsonObject | None:
     """Return the rank histogram of an ensemble since its start."""
     counts = status.account.get("ranks")
     if not isinstance(counts, list) or not sum(counts):
@@ -166,7 +166,7 @@ def _ranks(status: Status) -> dict[str, Any] | None:
     return {"counts": counts, "low": number(low), "high": number(high)}
 
 
-def _particles(status: Status, events: Events, track: Track) -> dict[str, Any] | None:
+def _particles(status: Status, events: Events, track: Track) -> JsonObject | None:
     """Return the effective number of particles and of their ancestors over time: the minimum of each stretch."""
     rows = np.flatnonzero(np.isfinite(track.effective))
     if not rows.size:
@@ -181,7 +181,7 @@ def _particles(status: Status, events: Events, track: Track) -> dict[str, Any] |
     return {"t": listed(ago, 5), **lines, "count": said.get("particles"), "lag": said.get("lag")}
 
 
-def _correlation(engine: Running) -> dict[str, Any]:
+def _correlation(engine: Running) -> JsonObject:
     """Return the correlations of the present covariance by shown state, or the reason why there are none."""
     model = engine.model
     cov = engine.belief().cov
@@ -198,7 +198,7 @@ def _correlation(engine: Running) -> dict[str, Any]:
     return {"names": names, "matrix": listed(matrix, 3), "reason": left}
 
 
-def _observability(engine: Running, found: FoldFigures | None) -> dict[str, Any]:
+def _observability(engine: Running, found: FoldFigures | None) -> JsonObject:
     if found is None:
         return {"reason": "being computed", "states": {}}
     view = found.observability
@@ -216,7 +216,7 @@ def _observability(engine: Running, found: FoldFigures | None) -> dict[str, Any]
     }
 
 
-def _unseen(status: Status) -> dict[str, Any]:
+def _unseen(status: Status) -> JsonObject:
     """Return the minimal detectable faults and the protection level of each state."""
     found = status.integrity
     if found is None:

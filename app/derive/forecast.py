@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 import time
 from collections.abc import Container, Mapping, Sequence
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 
@@ -17,6 +17,7 @@ from estimators.model.state_space import StateSpaceModel
 
 from ..engine.copies import MAX_PULL_ROWS, Here
 from ..engine.running_fold import Running
+from ..result import JsonObject
 from .row_figures import listed, number
 
 MAX_CHANGES = 200  # changes of one input
@@ -37,7 +38,7 @@ class ForecastQuestion(NamedTuple):
     repeated: tuple[str, ...] = ()
 
 
-def question_from_json(body: Any, model: StateSpaceModel) -> ForecastQuestion:
+def question_from_json(body: object, model: StateSpaceModel) -> ForecastQuestion:
     """Parse `{"horizon": s, "inputs": {name: value | [[t, value], ...] | "repeat"}, "limits": {state: value}}`.
 
     Raises:
@@ -64,7 +65,7 @@ class Forecasts:
     def __init__(self, engine: Running) -> None:
         self._engine = engine
 
-    def may(self) -> dict[str, Any]:
+    def may(self) -> JsonObject:
         """Return the longest horizon and the length of a step, s.
 
         Raises:
@@ -79,7 +80,7 @@ class Forecasts:
             raise ConfigError("forecast: no reading has come yet, so there is no estimate to go on from")
         return here
 
-    def compute(self, question: ForecastQuestion) -> dict[str, Any]:
+    def compute(self, question: ForecastQuestion) -> JsonObject:
         """Return the forecast, see `forecast_json`.
 
         Raises:
@@ -121,7 +122,7 @@ class Forecasts:
         return {**told, "chosen": chosen, "step": step, "took": time.monotonic() - begun}
 
 
-def forecast_json(model: StateSpaceModel, here: Here, found: Forecast, withheld: Container[str]) -> dict[str, Any]:
+def forecast_json(model: StateSpaceModel, here: Here, found: Forecast, withheld: Container[str]) -> JsonObject:
     """Return a forecast as JSON.
 
     `now` is in seconds of the log, `t` in seconds from then; `states` have mean and the edges of their ± 1σ and ± 2σ
@@ -176,7 +177,7 @@ def forecast_json(model: StateSpaceModel, here: Here, found: Forecast, withheld:
 _EDGES = ("lower2", "lower1", "upper1", "upper2")
 
 
-def _crossing(item: Crossing, t: np.ndarray) -> dict[str, Any]:
+def _crossing(item: Crossing, t: np.ndarray) -> JsonObject:
     probability = item.probability[: t.size]
     early, middle, late = (number(first_time(t, probability, share)) for share in SHARES)
     return {
@@ -202,7 +203,7 @@ def _step(here: Here, horizon: float, longest: float) -> float:
     return step
 
 
-def _named(where: str, given: Any, names: Any) -> dict[str, Any]:
+def _named(where: str, given: object, names: Sequence[str]) -> JsonObject:
     if not isinstance(given, dict):
         raise ConfigError(f"forecast: {where} is {given!r}; it must be an object of names and values")
     unknown = next((name for name in given if name not in names), None)
@@ -211,7 +212,7 @@ def _named(where: str, given: Any, names: Any) -> dict[str, Any]:
     return given
 
 
-def _changes(where: str, given: Any, horizon: float) -> list[tuple[float, float]]:
+def _changes(where: str, given: object, horizon: float) -> list[tuple[float, float]]:
     if not isinstance(given, list):
         return [(0.0, _number(where, given))]
     if not 0 < len(given) <= MAX_CHANGES or not all(isinstance(pair, list) and len(pair) == 2 for pair in given):
@@ -223,7 +224,7 @@ def _changes(where: str, given: Any, horizon: float) -> list[tuple[float, float]
     return pairs
 
 
-def _number(where: str, value: Any) -> float:
+def _number(where: str, value: object) -> float:
     if isinstance(value, bool) or not isinstance(value, (int, float)) or not abs(value) <= LARGEST:
         raise ConfigError(f"forecast: {where} is {value!r}; it must be a finite number")
     return float(value)
@@ -283,7 +284,7 @@ def recorded(engine: Running, names: Sequence[str], now: int, horizon: float) ->
     }
 
 
-def drawn_changes(changes: Changes) -> dict[str, list[Any]]:
+def drawn_changes(changes: Changes) -> dict[str, list[object]]:
     """Return the changes of an input as points to draw."""
     few = changes[:: max(1, math.ceil(len(changes) / (2 * MAX_TIMES)))]
     return {"t": listed(np.array([t for t, _ in few])), "value": listed(np.array([value for _, value in few]))}

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from typing import Any
+from typing import SupportsFloat
 
 import numpy as np
 
@@ -35,6 +35,7 @@ from estimators.track import FAILED, GATED, HELD_OUT, SCREENED, USED, Track
 from estimators.tuning import Tuning
 
 from ..columns import rows_of
+from ..result import JsonObject
 from ..study.calibration_lines import worst_part
 
 LAGS = 50
@@ -50,7 +51,7 @@ COVERED = 4000  # measurements of a row whose coverage is divided: a question ta
 
 def rows_json(
     model: StateSpaceModel, events: Events, track: Track, tuning: Tuning, *, marginal: bool
-) -> list[dict[str, Any]]:
+) -> list[JsonObject]:
     """Return distribution, correlation and verdict of the whitened innovations of each row of the last events.
 
     For `autocorrelation` a rejected measurement is clipped to the gate, so that one spike does not hide the others.
@@ -163,7 +164,7 @@ def _share(track: Track, own: np.ndarray, verdicts: tuple[int, ...]) -> float | 
     return number(np.mean(np.isin(track.verdict[own], verdicts)), 3) if own.any() else None
 
 
-def _figures(calibration: Calibration | None) -> dict[str, Any]:
+def _figures(calibration: Calibration | None) -> JsonObject:
     """Return the sizes of effects with their intervals: value, low, high."""
     figures: dict[str, Interval] = {} if calibration is None else {
         "scale": calibration.scale, "bias": calibration.bias, "correlation": calibration.correlation,
@@ -171,7 +172,7 @@ def _figures(calibration: Calibration | None) -> dict[str, Any]:
     return {name: [number(value, 3) for value in interval] for name, interval in figures.items()}
 
 
-def _coverage(bins: list[CoverageBin], units: dict[str, str]) -> dict[str, Any]:
+def _coverage(bins: list[CoverageBin], units: dict[str, str]) -> JsonObject:
     """Return coverage with its interval by time, the lowest by operating point in words, and the adaptive interval's.
 
     `t` has the ends of each part, s. `adaptive` has the coverage of the adaptive conformal interval and its width
@@ -187,12 +188,12 @@ def _coverage(bins: list[CoverageBin], units: dict[str, str]) -> dict[str, Any]:
     }
 
 
-def number(value: Any, digits: int = 6) -> float | None:
+def number(value: SupportsFloat, digits: int = 6) -> float | None:
     """Round to so many significant digits; None if it is not finite."""
     value = float(value)
     return float(f"{value:.{digits}g}") if math.isfinite(value) else None
 
 
-def listed(values: np.ndarray, digits: int = 6) -> list[Any]:
+def listed(values: np.ndarray, digits: int = 6) -> list[object]:
     """Return an array as nested lists of rounded numbers."""
     return [listed(row, digits) if np.ndim(row) else number(row, digits) for row in values]

@@ -6,7 +6,7 @@ import time
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 
@@ -24,6 +24,7 @@ from estimators.track import Track
 from estimators.tuning import Tuning
 from sources.faults.layer import FaultStatus
 
+from ..result import JsonObject
 from .notices import Notice
 
 MAX_PULL_ROWS = 16_384
@@ -115,7 +116,7 @@ class LogTail:
     estimator: str
     tuning: Tuning
     taken: int
-    intake: Mapping[str, Any]
+    intake: JsonObject
     mark: int = 0
 
     @property

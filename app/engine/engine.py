@@ -101,8 +101,8 @@ class Engine(Running):
         Raises:
             NisusError: If the source cannot be opened or the model does not compile.
         """
-        self._inbox: queue.SimpleQueue[SourceBatch | Callable[[], Any]] = queue.SimpleQueue()
-        self._submitted: deque[Callable[[], Any]] = deque()
+        self._inbox: queue.SimpleQueue[SourceBatch | Callable[[], object]] = queue.SimpleQueue()
+        self._submitted: deque[Callable[[], object]] = deque()
         """Commands and reloads that wait in the inbox; a fold is left unfinished for them."""
         self._compile_queue = compile_queue or CompileQueue()
         super().__init__(twin, Watchdog(self._report_stalled), base, self._compile_queue.ready, stored)
@@ -227,7 +227,7 @@ class Engine(Running):
         """
         self._submit(partial(self._reload, twin, why, exact))
 
-    def _submit(self, work: Callable[[], Any]) -> None:
+    def _submit(self, work: Callable[[], object]) -> None:
         self._submitted.append(work)
         self._inbox.put(lambda: self._submitted.popleft()())
 
@@ -312,7 +312,7 @@ class Engine(Running):
         counts = self.notices.counts(), {"inflated": self._late, "held": self._intake.held}
         return status_of(self._fold, self._row_counts, self._watchers, self.source, fields, *counts)
 
-    def _known_fields(self, refolding: bool) -> dict[str, Any]:
+    def _known_fields(self, refolding: bool) -> dict[str, object]:
         """Return the fields of a status that are known without the fold.
 
         Estimator and tuning are the requested ones, which differ from the fold's while a refold is waited for.
@@ -348,7 +348,7 @@ class Engine(Running):
     def _round(self, timeout: float) -> None:
         """Wait for an item, then handle all that are in the inbox."""
         try:
-            item: Any = self._inbox.get(timeout=timeout)
+            item: SourceBatch | Callable[[], object] | None = self._inbox.get(timeout=timeout)
         except queue.Empty:
             self._when_idle()
             return

@@ -6,7 +6,7 @@ import math
 import time
 from collections.abc import Callable, Mapping, Sequence
 from functools import partial
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 from estimators.errors import ConfigError, nearest, printable, quoted
 from estimators.estimator import Estimator
@@ -15,6 +15,7 @@ from estimators.fold_checks import check_variances
 from estimators.log import RESET, Events
 from estimators.model.state_space import StateSpaceModel
 from estimators.registry import checked, find_estimator
+from estimators.tuning import Tuning
 from sources.source import Source, controls_of, span_of
 
 from ..format_time import duration_text
@@ -23,9 +24,6 @@ from . import commands
 from .copies import AlertMute
 from .faults import prepared_fault
 from .running_fold import Running
-
-if TYPE_CHECKING:
-    from estimators.tuning import Tuning
 
 REFOLDING = (
     commands.SetEstimator | commands.SetTuning | commands.SetTunings | commands.SetOption | commands.UseSensor
@@ -59,7 +57,7 @@ def execute(command: commands.Command, engine: Running) -> None:
     prepared(command, engine)()
 
 
-def prepared(command: commands.Command, engine: Running) -> Callable[[], Any]:
+def prepared(command: commands.Command, engine: Running) -> Callable[[], object]:
     """Check a command, in any thread, and return what carries it out on the engine's thread.
 
     Raises:
@@ -175,7 +173,7 @@ def retuned(command: REFOLDING, engine: Running) -> tuple[str, Tuning]:
     return estimator, _with_options(estimator, tuning, changed, engine) if changed else tuning
 
 
-def _with_options(estimator: str, tuning: Tuning, changed: Mapping[str, Any], engine: Running) -> Tuning:
+def _with_options(estimator: str, tuning: Tuning, changed: Mapping[str, float | str], engine: Running) -> Tuning:
     entry = find_estimator(estimator, engine.model)
     known = entry.complete(changed)
     options = {**tuning.options, **{name: known[name] for name in changed}}
@@ -211,7 +209,9 @@ def maintained_states(what: str, states: Sequence[str], model: StateSpaceModel) 
     return sorted(model.state_names.index(name) for name in states)
 
 
-def playback(source: Source, command: Any, first: int) -> Callable[[], Any]:
+def playback(
+    source: Source, command: commands.Pause | commands.Speed | commands.Seek | commands.Step, first: int
+) -> Callable[[], object]:
     """Check one of `PLAYBACK`, and return what carries it out; `first` is the time of the first event, ns.
 
     Raises:

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable
 from dataclasses import replace
 from math import inf
-from typing import Any, Protocol, runtime_checkable
+from typing import Protocol, runtime_checkable
 
 from estimators.errors import LARGEST, ConfigError, SourceError, nearest, quoted
 from estimators.model.state_space import StateSpaceModel
@@ -13,6 +13,7 @@ from sources.faults.kinds import KINDS, OLD_NAMES, Fault, find_kind, numbers, pr
 from sources.faults.layer import Faults, FaultStatus
 from sources.source import Source
 
+from ..result import JsonObject
 from . import commands
 
 FAULT_FIELDS = {"end": "duration", "sensor": "target", "input": "target", "parameter": "target"}
@@ -123,7 +124,7 @@ def fault_text(fault: Fault, model: StateSpaceModel) -> str:
     return ", ".join([f"{kind.name} of {fault.target}{with_other}", *parts])
 
 
-def status_json(items: tuple[FaultStatus, ...], model: StateSpaceModel) -> list[dict[str, Any]]:
+def status_json(items: tuple[FaultStatus, ...], model: StateSpaceModel) -> list[JsonObject]:
     """Return the active and planned faults for the API; `since` in ns, null for a planned one."""
     return [
         {
@@ -139,7 +140,7 @@ def status_json(items: tuple[FaultStatus, ...], model: StateSpaceModel) -> list[
     ]
 
 
-def catalogue_json(source: Source, model: StateSpaceModel) -> dict[str, Any]:
+def catalogue_json(source: Source, model: StateSpaceModel) -> JsonObject:
     """Return the kinds of fault with their parameters and possible targets, for the page."""
     layer = source.faults if isinstance(source, Faulty) else None
     return {

@@ -5,7 +5,7 @@ from __future__ import annotations
 import queue
 import threading
 from collections.abc import Callable
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import TYPE_CHECKING, NamedTuple
 
 from estimators.errors import reason_of
 from sources.source import controls_of
@@ -38,7 +38,7 @@ class Feeder:
     def __init__(
         self,
         open_source: Callable[[], Source],
-        inbox: queue.SimpleQueue[Any],
+        inbox: queue.SimpleQueue[SourceBatch | Callable[[], object]],
         report: Callable[[str, str], None],
         *,
         restarted: Callable[[], None] = lambda: None,
@@ -101,7 +101,7 @@ class Feeder:
         return len(batch)
 
     @property
-    def innermost(self) -> Any:
+    def innermost(self) -> Source:
         """The source itself, also if faults are injected into it."""
         return getattr(self.source, "inner", self.source)
 

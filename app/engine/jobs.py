@@ -12,13 +12,15 @@ import os
 import sys
 import threading
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from concurrent.futures import Executor, Future, wait
-from typing import Any
+from typing import Any, TypeVar
 
 from estimators.errors import reason_of
 
 from .notices import Notices
+
+T = TypeVar("T")
 
 MAX_JOBS = 3
 """Jobs that run at once; the others wait. A fit, an advice and a smoother may each take minutes."""
@@ -49,7 +51,7 @@ class Job:
         *,
         stale: Callable[[], bool] = lambda: False,
         every: float | None = None,
-        failed: Callable[[str], Any] = lambda reason: None,
+        failed: Callable[[str], object] = lambda reason: None,
     ) -> None:
         """See `Jobs.run`."""
         self.name, self.work, self.every, self.failed = name, work, every, failed
@@ -124,7 +126,9 @@ class PacedExecutor(Executor):
     def __init__(self, job: Job) -> None:
         self._job = job
 
-    def map(self, fn: Callable[..., Any], *iterables: Any, timeout: Any = None, chunksize: int = 1) -> Iterator[Any]:
+    def map(
+        self, fn: Callable[..., T], *iterables: Iterable[object], timeout: float | None = None, chunksize: int = 1
+    ) -> Iterator[T]:
         """Apply a function as the built-in `map` does; raise `JobCancelled` once the job is not wanted."""
         took = 0.0
         for items in zip(*iterables, strict=False):
@@ -166,7 +170,7 @@ class Jobs:
         *,
         stale: Callable[[], bool] = lambda: False,
         every: float | None = None,
-        failed: Callable[[str], Any] | None = None,
+        failed: Callable[[str], object] | None = None,
     ) -> Job:
         """Queue a job.
 
@@ -276,7 +280,7 @@ class Jobs:
 class LoopThread(threading.Thread):
     """Daemon thread of a loop, which ends soon after `stopping` is set."""
 
-    def __init__(self, run: Callable[[], Any], name: str) -> None:
+    def __init__(self, run: Callable[[], object], name: str) -> None:
         """Prepare; nothing runs before `start`."""
         super().__init__(target=run, name=name, daemon=True)
         self.stopping = threading.Event()
@@ -288,7 +292,7 @@ class LoopThread(threading.Thread):
             self.join(seconds)
 
 
-def run_all(*works: Callable[[], Any]) -> None:
+def run_all(*works: Callable[[], object]) -> None:
     """Run callables concurrently, the first in this thread, and wait for all.
 
     Raises:
@@ -304,14 +308,14 @@ def run_all(*works: Callable[[], Any]) -> None:
         outcome.result()
 
 
-def start_in_thread(work: Callable[[], Any], name: str) -> Future[Any]:
+def start_in_thread(work: Callable[[], T], name: str) -> Future[T]:
     """Call a function in a daemon thread of its own; the future has its result or error."""
-    outcome: Future[Any] = Future()
+    outcome: Future[T] = Future()
     threading.Thread(target=carry_out, args=(outcome, work), name=name, daemon=True).start()
     return outcome
 
 
-def carry_out(outcome: Future[Any], work: Callable[[], Any]) -> None:
+def carry_out(outcome: Future[T], work: Callable[[], T]) -> None:
     """Call a function, and put its result or error into a future that is not cancelled."""
     if not outcome.set_running_or_notify_cancel():
         return

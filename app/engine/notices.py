@@ -8,7 +8,6 @@ import time
 from collections import Counter, deque
 from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass, replace
-from typing import Any
 
 from estimators.errors import ConfigError, printable, quoted
 
@@ -138,7 +137,7 @@ class AuditEntry:
     role: str
     address: str
     path: str
-    body: Mapping[str, Any]
+    body: Mapping[str, object]
     revision: int
     change: int = 0
 
@@ -152,7 +151,7 @@ class Audit:
         self._entries: deque[AuditEntry] = deque(maxlen=MAX_COMMANDS)
         self._next = self._changes = 0
 
-    def add(self, user: Iterable[str], path: str, body: Mapping[str, Any], revision: int | None = None) -> None:
+    def add(self, user: Iterable[str], path: str, body: Mapping[str, object], revision: int | None = None) -> None:
         """Note a request of a user (name, role and address) that was carried out.
 
         `revision` was shown when it arrived, by default that of now.

@@ -24,6 +24,7 @@ from estimators.snapshots import PERMANENT_SPACING, Base
 from estimators.tuning import Tuning
 from sources.source import Source
 
+from ..result import JsonObject
 from .batches import BatchSizer, FairLock, Requests
 from .copies import AlertMute, Belief, Cursor, EventWindow, Here, LogTail, Pull, Status, event_window
 from .counts import RowCounts
@@ -63,7 +64,7 @@ class Records(Protocol):
 class Published(Protocol):
     """Outputs of a running twin."""
 
-    def json(self) -> dict[str, Any]:
+    def json(self) -> JsonObject:
         """Return the state of outputs, receivers and alerts."""
 
 
@@ -93,7 +94,7 @@ class StoredTwin:
     annotations: tuple[Annotation, ...]
     written: float
     closed: bool
-    numbers: Mapping[str, Any]
+    numbers: JsonObject
     episodes: tuple[TrackedEpisode, ...]
     commands: tuple[AuditEntry, ...]
 
@@ -148,7 +149,7 @@ class Running(ABC):
         self._logs = 0
         self._taken = self._mark = 0
         """Events that the source gave since it began, and its mark after them; see `SourceBatch`."""
-        self._intake_state: Mapping[str, Any] = {}
+        self._intake_state: JsonObject = {}
         if stored is not None:
             self.estimator, self.tuning = stored.tail.estimator, stored.tail.tuning
             self.revisions.restore(stored.runs)
@@ -189,7 +190,7 @@ class Running(ABC):
         return self._feeder.source
 
     @property
-    def innermost(self) -> Any:
+    def innermost(self) -> Source:
         """The source itself, also if faults are injected into it."""
         return self._feeder.innermost
 

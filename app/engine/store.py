@@ -13,7 +13,7 @@ import struct
 import threading
 import time
 import zlib
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager, suppress
 from dataclasses import asdict, replace
 from functools import partial
@@ -30,6 +30,7 @@ from estimators.log import Events, Log
 from sources.source import Marked
 
 from ..format_time import counted, duration_text, format_time
+from ..result import JsonObject
 from ..twin.changes import difference, merged, shape
 from ..twin.twin import VERSION, Twin, restore_twin, with_version
 from .copies import LogTail
@@ -136,15 +137,15 @@ class Store:
                 run(f"PRAGMA application_id={APPLICATION_ID}")
                 run(f"PRAGMA user_version={FORMAT}")
 
-    def parts(self) -> tuple[dict[str, Any], list[tuple[int, Events]], list[dict[str, Any]]]:
+    def parts(self) -> tuple[JsonObject, list[tuple[int, Events]], list[JsonObject]]:
         """Return the parts from JSON, the rows of events with the index of their first one, and the last commands.
 
         Raises:
             SourceError: If the file is damaged.
         """
-        found: dict[str, Any] = {}
+        found: JsonObject = {}
         rows: list[tuple[int, Events]] = []
-        commands: list[dict[str, Any]] = []
+        commands: list[JsonObject] = []
         with self._failing():
             own = "kind != ? AND (kind != ? OR at > (SELECT max(at) FROM parts WHERE kind = ?) - ?)"
             for kind, at, count, data in self._read(own, ALERTS, COMMANDS, COMMANDS, MAX_COMMANDS):
@@ -233,7 +234,7 @@ class Store:
         self._put(EVENTS, at, len(events), _events_to_bytes(events))
         rows.append((at, len(events)))
 
-    def _read(self, condition: str, *given: Any) -> Iterator[tuple[str, int, int, bytes]]:
+    def _read(self, condition: str, *given: int | str) -> Iterator[tuple[str, int, int, bytes]]:
         """Yield kind, number, count of events, and data of parts in their order."""
         sql = f"SELECT * FROM parts WHERE {condition} ORDER BY kind, at"
         for kind, at, count, crc, data in self._file.execute(sql, given):
@@ -354,7 +355,7 @@ def open_store(path: Path, twin: Twin) -> tuple[Store | None, StoredTwin | None,
 
 
 def _stored_twin(
-    parts: Mapping[str, Any], rows: list[tuple[int, Events]], commands: list[dict[str, Any]], twin: Twin
+    parts: JsonObject, rows: list[tuple[int, Events]], commands: list[JsonObject], twin: Twin
 ) -> StoredTwin:
     state, header = parts["state"], parts["twin"]
     version = None if header["version"] is None else version_from_json(header["version"])
@@ -422,12 +423,12 @@ def _check_integers(items: list[Any]) -> None:
 _RUN_FIELDS = ("number", "began", "loaded", "name", "note", "place", "why", "first", "gesture")
 
 
-def _run_to_json(run: Revision) -> dict[str, Any]:
+def _run_to_json(run: Revision) -> JsonObject:
     known = {name: getattr(run, name) for name in _RUN_FIELDS}
     return known | {"settings": tuning_to_json(run.tuning, run.estimator)}
 
 
-def _run_from_json(values: Mapping[str, Any], twin: Twin) -> Revision:
+def _run_from_json(values: JsonObject, twin: Twin) -> Revision:
     tuning, estimator = tuning_from_json(values["settings"], twin.model)
     tuning = replace(tuning, baseline=twin.tuning.baseline)
     return Revision(estimator=estimator, tuning=tuning, **{name: values[name] for name in _RUN_FIELDS})
@@ -455,10 +456,10 @@ class StoreWriter:
         """Begin with the content of the store, which the engine has not changed yet."""
         self._engine, self._store = engine, store
         self._cursor = engine.cursor(follows_log=True)
-        self._written: dict[str, Any] = {}
+        self._written: JsonObject = {}
         self._mark, self._command = 0, 0
         self._failed = False
-        self._episodes: tuple[Any, tuple[TrackedEpisode, ...]] = ((), ())
+        self._episodes: tuple[object, tuple[TrackedEpisode, ...]] = ((), ())
         if stored is not None:
             engine.tail(self._cursor)
         if isinstance(engine.innermost, Marked):
@@ -517,7 +518,7 @@ class StoreWriter:
         tail = engine.tail(self._cursor)
         source, commands = engine.innermost, engine.audit.entries(self._command)
         episodes = self._tracked_episodes()
-        now: dict[str, tuple[Any, Any]] = {
+        now: dict[str, tuple[object, Callable[[], str]]] = {
             "twin": (twin, partial(_twin_to_json, twin)),
             "base": (tail.base, partial(base_to_json, tail.base)),
             "tuning": ((tail.estimator, tail.tuning), partial(tuning_to_json, tail.tuning, tail.estimator)),
@@ -560,7 +561,7 @@ class StoreWriter:
         self._store.close()
 
 
-def _is_same(one: Any, other: Any) -> bool:
+def _is_same(one: object, other: object) -> bool:
     """Return whether two parts are the same objects."""
     if isinstance(one, tuple) and isinstance(other, tuple):
         return len(one) == len(other) and all(a is b for a, b in zip(one, other, strict=True))
@@ -573,6 +574,6 @@ def _twin_to_json(twin: Twin) -> str:
     return json.dumps(header | {"version": version})
 
 
-def _plain(value: Any) -> Any:
+def _plain(value: np.ndarray | np.generic | Iterable[object]) -> object:
     """Return an array, number or queue of NumPy or Python for JSON."""
     return value.tolist() if isinstance(value, np.ndarray | np.generic) else list(value)

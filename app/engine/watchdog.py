@@ -13,18 +13,16 @@ from collections.abc import Callable, Iterable, Iterator
 from concurrent.futures import wait
 from contextlib import contextmanager
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from types import FrameType
 
 from config.loader import shown_path
+from estimators.fold import Fold
 from estimators.fold_failures import questions_of
 from estimators.model.state_space import StateSpaceModel
 from estimators.numerics.jit import plain
 
 from ..terminal import complain
 from .jobs import start_in_thread
-
-if TYPE_CHECKING:
-    from estimators.fold import Fold
 
 CALL_TIMEOUT_S = 10.0
 """Seconds that one call of a model's function may take before a line names it."""
@@ -55,7 +53,7 @@ class CallWatch:
         self._names = {code: what for code, what in codes if code is not None}
         self._model = model.name
         self._clock = clock
-        self._seen: tuple[Any, float] | None = None
+        self._seen: tuple[FrameType, float] | None = None
 
     def check(self) -> str | None:
         """Return a line once a call has taken `CALL_TIMEOUT_S`; None otherwise."""
@@ -77,13 +75,13 @@ class CallWatch:
         frame = self._call()
         return None if frame is None else self._place(frame)
 
-    def _place(self, frame: Any) -> str:
+    def _place(self, frame: FrameType) -> str:
         code = frame.f_code
         return f"{shown_path(Path(code.co_filename))}:{frame.f_lineno}: {self._names[code]} of the model {self._model}"
 
-    def _call(self) -> Any:
+    def _call(self) -> FrameType | None:
         for thread_frame in sys._current_frames().values():
-            frame: Any = thread_frame
+            frame: FrameType | None = thread_frame
             while frame is not None:
                 if frame.f_code in self._names:
                     return frame
@@ -96,7 +94,7 @@ class Watchdog:
 
     def __init__(
         self,
-        say: Callable[[str, str], Any],
+        say: Callable[[str, str], object],
         *,
         then: str = STALLED_REMEDY,
         long: float = STALLED_AFTER_S,
@@ -156,7 +154,7 @@ class Watchdog:
             self._say(self.text, "error")
 
 
-def interruptible(fold: Fold, work: Callable[[], Any]) -> None:
+def interruptible(fold: Fold, work: Callable[[], object]) -> None:
     """Run work that folds in a thread that may be left behind, so that Ctrl-C ends even a call that never returns.
 
     A function of the fold's model that does not return is named on standard error. Raises as the work.
@@ -179,7 +177,7 @@ def _in_python(fold: Fold) -> str | None:
     return CallWatch(fold.model).where() if fold.model.black_box else None
 
 
-def unanswered(questions: Iterable[tuple[str, Callable[[], Any]]], timeout: float | None = None) -> str | None:
+def unanswered(questions: Iterable[tuple[str, Callable[[], object]]], timeout: float | None = None) -> str | None:
     """Return the name of the first function that does not return within `timeout` seconds; None if all do.
 
     They are called in a thread of its own, which is lost with the one that does not return.

@@ -14,7 +14,7 @@ import uuid
 from collections import deque
 from collections.abc import Callable
 from dataclasses import replace
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 import rerun as rr
@@ -22,13 +22,10 @@ import rerun as rr
 from ..charts.colors import EITHER, Palette
 from ..engine.copies import MAX_PULL_ROWS, Pull
 from ..engine.history_copy import follow, joined
-from ..engine.notices import MAX_LINES
+from ..engine.notices import MAX_LINES, Notice
+from ..engine.running_fold import Running
 from .rows import RerunRows
 from .sink import free_closed_streams
-
-if TYPE_CHECKING:
-    from ..engine.notices import Notice
-    from ..engine.running_fold import Running
 
 HISTORY_STRETCHES = 3000  # Stretches into which a whole history is cut for drawing
 

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from typing import Any
 
 import numpy as np
 import rerun as rr
@@ -41,7 +40,7 @@ def blueprint(
     )
     axis = rrb.TimeAxis(view_range=span)
 
-    def chart(name: str, contents: list[str], **more: Any) -> rrb.TimeSeriesView:
+    def chart(name: str, contents: list[str], **more: object) -> rrb.TimeSeriesView:
         return rrb.TimeSeriesView(
             origin=f"{root}/", contents=[f"+ {root}{path}" for path in contents], name=name, axis_x=axis,
             plot_legend=rrb.PlotLegend(visible=False), **more,
@@ -110,11 +109,11 @@ def blueprint(
     )  # fmt: skip
 
 
-def _tabs(views: list[Any]) -> list[Any]:
+def _tabs(views: list[rrb.View | rrb.Container]) -> list[rrb.View | rrb.Container]:
     return views if len(views) < 2 else [rrb.Tabs(*views)]
 
 
-def _stacked(views: list[Any]) -> list[Any]:
+def _stacked(views: list[rrb.View | rrb.Container]) -> list[rrb.View | rrb.Container]:
     """Views one above the other; if they are many, in tabs that hold as many as one can read at once."""
     if len(views) <= MAX_VISIBLE_CHARTS:
         return views
@@ -131,7 +130,7 @@ def styles(
 ) -> None:
     """Log how everything is drawn; static, so that it holds at every time."""
 
-    def style(path: str, what: Any) -> None:
+    def style(path: str, what: rr.AsComponents) -> None:
         stream.log(f"{root}{path}", what, static=True)
 
     light, grey = band_color(palette), palette.previous
@@ -195,7 +194,9 @@ def field_pictures(model: StateSpaceModel, root: str, *, truth: bool) -> rrb.Hor
     return rrb.Horizontal(views["estimate"], views["std"], rrb.Tabs(views["error"], views["truth"]))
 
 
-def field_charts(model: StateSpaceModel, chart: Callable[..., Any], *, truth: bool) -> list[Any]:
+def field_charts(
+    model: StateSpaceModel, chart: Callable[..., object], *, truth: bool
+) -> list[rrb.View | rrb.Container]:
     """Charts of what all cells, and all rows of each sensor, come to."""
     assert model.grid is not None
     title = "RMSE, spread of all cells" if truth else "spread of all cells"
@@ -206,7 +207,7 @@ def field_charts(model: StateSpaceModel, chart: Callable[..., Any], *, truth: bo
     return found
 
 
-def field_styles(style: Callable[[str, Any], None], model: StateSpaceModel, palette: Palette) -> None:
+def field_styles(style: Callable[[str, rr.AsComponents], None], model: StateSpaceModel, palette: Palette) -> None:
     """How the lines of a field are drawn."""
     style("/field/rmse", rr.SeriesLines(colors=[palette.truth], names=["RMSE"], widths=[2.0]))
     style("/field/spread", rr.SeriesLines(colors=[palette.estimate], names=["spread"], widths=[2.0]))

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import Any
 
 import numpy as np
 import rerun as rr
@@ -64,7 +63,7 @@ class Sink:
             return rr.TimeColumn(TIMELINE, timestamp=t.astype("datetime64[ns]"))
         return rr.TimeColumn(TIMELINE, duration=t.astype("timedelta64[ns]"))
 
-    def static(self, path: str, what: Any) -> None:
+    def static(self, path: str, what: rr.AsComponents) -> None:
         """Log values that apply at every time."""
         self.stream.log(f"{self.root}{path}", what, static=True)
 
@@ -98,7 +97,7 @@ class Sink:
         rows = thin(t, key.min(axis=1), key.max(axis=1), width)
         self.columns(path, t[rows], rr.Scalars.columns(scalars=np.ascontiguousarray(values[rows])))
 
-    def columns(self, path: str, t: np.ndarray, what: Any) -> None:
+    def columns(self, path: str, t: np.ndarray, what: rr.ComponentColumnList) -> None:
         """Log columns of one component, one row per time."""
         self.stream.send_columns(f"{self.root}{path}", indexes=[self.times(t)], columns=what)
 
@@ -133,7 +132,7 @@ def row_title(model: StateSpaceModel, sensor: int, row: int) -> str:
     return with_unit(model.row_names[model.row_start[sensor] + row], model.sensors[sensor].rows[row].unit)
 
 
-def pair_name(model: StateSpaceModel, pair: Any) -> str:
+def pair_name(model: StateSpaceModel, pair: Sequence[int] | np.ndarray) -> str:
     """Return the entity name of a pair of states."""
     return f"{model.state_names[pair[0]]}_{model.state_names[pair[1]]}"
 

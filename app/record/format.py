@@ -16,7 +16,6 @@ from collections.abc import Mapping, Sequence
 from contextlib import suppress
 from dataclasses import replace
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pyarrow as pa
@@ -37,7 +36,7 @@ from ..engine.fold_json import base_to_json, tuning_to_json, version_to_json
 from ..engine.history_copy import copy_rows
 from ..engine.notices import Annotation
 from ..engine.running_fold import Running
-from ..result import plain
+from ..result import JsonObject, plain
 from ..twin.twin import Twin
 from .rrd_file import END_MESSAGE, MESSAGE_HEADER, STREAM_HEADER, TAKEN, messages
 
@@ -97,12 +96,12 @@ class RecordingFile:
         """Write the tuning that applies from event `index` on."""
         self._send("tuning", TIMELINE, [index], json=[tuning_to_json(tuning, estimator)], revision=[revision])
 
-    def _send(self, name: str, timeline: str, index: Any, **columns: Any) -> None:
+    def _send(self, name: str, timeline: str, index: Sequence[int] | np.ndarray, **columns: object) -> None:
         """Write rows of an entity under /nisus with these columns, at these indices of a timeline."""
         indexes = [rr.TimeColumn(timeline, sequence=index)]
         self.stream.send_columns(f"/nisus/{name}", indexes=indexes, columns=rr.AnyValues.columns(**columns))
 
-    def summary(self, found: Mapping[str, Any]) -> None:
+    def summary(self, found: Mapping[str, object]) -> None:
         """Write the scores of the session, for lists."""
         self.stream.log("/nisus/summary", rr.AnyValues(json=json.dumps(dict(found))), static=True)
 
@@ -192,7 +191,7 @@ class RecordingFile:
         self.size += len(data)
 
 
-def summary_of(engine: Running) -> dict[str, Any]:
+def summary_of(engine: Running) -> JsonObject:
     """Return the scores of the running fold: see `summary`; fewer if they cannot be computed."""
     try:
         pull = copy_rows(engine)
@@ -206,7 +205,7 @@ def summary_of(engine: Running) -> dict[str, Any]:
 
 def summary(
     estimator: str, tuning: Tuning, events: Events, track: Track, pictures: Sequence[Picture] = ()
-) -> dict[str, Any]:
+) -> JsonObject:
     """Return the scores of a track: estimator, mean NIS with bounds and verdict, and one error.
 
     `error` is {name, rmse, unit, coverage, against} of the first state with a truth, or else of a held-out sensor.
@@ -217,7 +216,7 @@ def summary(
     return dict(plain({"estimator": estimator} | nis | {"error": _error(found, tuning.model)}))
 
 
-def _error(found: Score, model: StateSpaceModel) -> dict[str, Any] | None:
+def _error(found: Score, model: StateSpaceModel) -> JsonObject | None:
     units = units_by_name(model)
     for against, part in (("truth", found.states), ("held out", found.held_out)):
         for name, fit in part.items():

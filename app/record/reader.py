@@ -12,7 +12,6 @@ import warnings
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 from rerun.chunk import RrdReader
@@ -26,6 +25,7 @@ from estimators.snapshots import Base
 from ..engine.fold_json import base_from_json, version_from_json
 from ..engine.history_copy import last_written
 from ..engine.notices import Annotation
+from ..result import JsonObject
 from .format import BORDERED, FORMAT, PREFIX, READABLE, TIMELINE
 from .rrd_file import MAGIC, MESSAGE_HEADER, STREAM_HEADER, complete_until
 
@@ -140,7 +140,7 @@ class Facts:
     twin: str
     estimator: str | None
     seconds: float
-    summary: dict[str, Any]
+    summary: JsonObject
 
 
 def facts_of(path: Path) -> Facts:
@@ -168,8 +168,8 @@ class _Content:
     """Entities under /nisus, in the order of the file."""
 
     def __init__(self) -> None:
-        self.header: dict[str, Any] = {}
-        self.summary: dict[str, Any] = {}
+        self.header: JsonObject = {}
+        self.summary: JsonObject = {}
         self.tunings: list[str] = []
         self.notices: list[tuple[int, str, str]] = []
         self.annotations: dict[int, Annotation] = {}

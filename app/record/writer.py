@@ -10,11 +10,11 @@ import math
 import threading
 import time
 from collections import deque
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import replace
 from pathlib import Path
 from types import SimpleNamespace
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 from estimators.diagnostics.health import MAX_ROWS_PER_READING
 from estimators.errors import NisusError, SourceError
@@ -28,6 +28,8 @@ from ..format_time import counted
 from .rrd_file import DATE, NEVER, Disk, Split, part_path, surplus_parts
 
 if TYPE_CHECKING:
+    from rerun import RecordingStream
+
     from estimators.diagnostics.episodes import Episode
     from estimators.diagnostics.field_pictures import Picture
     from estimators.log import Log
@@ -48,10 +50,13 @@ ALL_STRETCHES = math.inf
 """`series` of `RerunRows`: charts as fine as on the page, however long the recording is."""
 
 
+Draw = Callable[["RecordingStream"], Callable[[Pull], None]]
+
+
 class Recorder:
     """Starts and stops recordings of one engine. `draw(stream)` returns a function that logs the charts of a pull."""
 
-    def __init__(self, engine: Running, draw: Any, split: Split = NEVER, folder: Path = Path()) -> None:
+    def __init__(self, engine: Running, draw: Draw, split: Split = NEVER, folder: Path = Path()) -> None:
         self._engine = engine
         self.folder = folder
         self._draw = draw
@@ -191,7 +196,7 @@ class RecordingPart:
     Rerun takes 50 MB, so it is imported with the first file.
     """
 
-    def __init__(self, engine: Running, asked: Path, draw: Any, *, before: RecordingPart | None = None) -> None:
+    def __init__(self, engine: Running, asked: Path, draw: Draw, *, before: RecordingPart | None = None) -> None:
         """Start a recording at a path, or the part that continues another."""
         from .format import RecordingFile
 

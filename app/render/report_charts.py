@@ -10,7 +10,6 @@ import json
 import posixpath
 import re
 from collections.abc import Mapping, Sequence
-from typing import Any
 
 import numpy as np
 
@@ -31,6 +30,7 @@ from ..charts.sensor_groups import sensor_groups
 from ..columns import columns_of, rows_of
 from ..engine.copies import Pull
 from ..engine.notices import Annotation
+from ..result import JsonObject
 
 MAX_GROUPS = 400
 """Groups of rows, of each of which the extremes are drawn."""
@@ -126,7 +126,7 @@ def _modules(names: Sequence[str]) -> dict[str, str]:
     return found
 
 
-def _script(value: Any) -> str:
+def _script(value: object) -> str:
     """Return JSON that cannot end the script element around it."""
     return json.dumps(value, allow_nan=False, separators=(",", ":")).replace("<", "\\u003c")
 
@@ -173,7 +173,7 @@ def _position(grid: Sequence[GridAxis], cell: Sequence[float]) -> str:
     return " ".join(places) if any("°" in axis.unit for axis in grid) else f"at {', '.join(places)}"
 
 
-def charted_model(model: StateSpaceModel, view: ViewSection) -> dict[str, Any]:
+def charted_model(model: StateSpaceModel, view: ViewSection) -> JsonObject:
     """Return states and sensor rows as charts need them: names, labels, units, and which rows measure which state."""
     measured, labels = measured_by(model), page_labels(model, view)
     return {

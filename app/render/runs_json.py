@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Container, Sequence
-from typing import Any
 
 from estimators.registry import ESTIMATORS
 
@@ -12,12 +11,12 @@ from ..derive.run_scores import RunScore, RunScores
 from ..derive.sweep import NoiseEstimates, Swept
 from ..engine.revisions import Revision
 from ..engine.running_fold import Running
-from ..result import plain
+from ..result import JsonObject, plain
 from ..study.fit_json import nis_json
 from ..twin.changes import SettingChange, in_words, units_of
 
 
-def runs_json(scores: RunScores, engine: Running) -> list[dict[str, Any]]:
+def runs_json(scores: RunScores, engine: Running) -> list[JsonObject]:
     """Return every run, oldest first, with its changes and scores."""
     units, found = units_by_name(engine.model), scores.all()
     there = {run.number for run, _ in found}
@@ -40,7 +39,7 @@ def runs_json(scores: RunScores, engine: Running) -> list[dict[str, Any]]:
     return runs
 
 
-def _score(known: RunScore, units: dict[str, str]) -> dict[str, Any]:
+def _score(known: RunScore, units: dict[str, str]) -> JsonObject:
     score = known.score
     fits = [(name, "truth", fit) for name, fit in score.states.items()]
     fits += [(name, "held out", fit) for name, fit in score.held_out.items()]
@@ -65,18 +64,18 @@ def what_changed(run: Revision, there: Container[int]) -> str:
     return f"back to {f'run {run.loaded}' if run.loaded in there else 'an earlier run'}: {words}"
 
 
-def changes_json(changes: Sequence[SettingChange]) -> list[dict[str, Any]]:
+def changes_json(changes: Sequence[SettingChange]) -> list[JsonObject]:
     """Return changed entries with their values before and after."""
     return [{"key": key, "values": plain([before, after])} for key, before, after in changes]
 
 
-def swept_json(swept: Swept) -> dict[str, Any]:
+def swept_json(swept: Swept) -> JsonObject:
     """Return a sweep as far as it is done, its most likely value, and the value at which the NIS is consistent."""
     best = swept.best
     return plain(swept) | plain({"best": None if best is None else best.value, "level": swept.level})
 
 
-def noise_json(noise: NoiseEstimates) -> dict[str, Any]:
+def noise_json(noise: NoiseEstimates) -> JsonObject:
     """Return the estimated R by key and the sweep of all of Q; `doubt` is the reason not to use an estimate."""
     estimates = {
         key: {"value": found.variance if found.variance > 0.0 else None, "std": found.std, "n": found.n}

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import io
 from collections.abc import Iterable, Iterator
-from typing import Any, NamedTuple
+from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 
@@ -19,6 +19,9 @@ from ..engine.history_copy import copy_rows
 from ..engine.revisions import Revision
 from ..engine.running_fold import Running
 
+if TYPE_CHECKING:
+    from pyarrow import Table
+
 PIECE = 8192
 """Rows formatted at once."""
 
@@ -26,7 +29,7 @@ KINDS = {"csv": "text/csv", "parquet": "application/vnd.apache.parquet"}
 """Formats and their media types."""
 
 
-def tables(rows: RunRows, part: slice) -> Iterator[Any]:
+def tables(rows: RunRows, part: slice) -> Iterator[Table]:
     """Yield the rows of a part as tables of at most `PIECE` rows and one schema, at least one table."""
     run, pull = rows
     model, found = run.tuning.model, rows.episodes()
@@ -44,7 +47,7 @@ def tables(rows: RunRows, part: slice) -> Iterator[Any]:
         )  # fmt: skip
 
 
-def encoded(kind: str, parts: Iterable[Any]) -> Iterator[bytes]:
+def encoded(kind: str, parts: Iterable[Table]) -> Iterator[bytes]:
     """Yield tables of one schema as the bytes of one file."""
     import pyarrow.csv
     import pyarrow.parquet

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from typing import Any
-
 import numpy as np
 import viser
 
@@ -100,7 +98,7 @@ class BeliefScene:
             titles = np.array([_title_place(k, False) for k in range(3)])
             self.outlook = Outlook(np.vstack((box, titles)), np.array([3.6, -5.2, 3.4]), fov=float(np.radians(33)))
 
-    def _body(self, shapes: Shapes, sigmas: int, palette: Palette) -> list[Any]:
+    def _body(self, shapes: Shapes, sigmas: int, palette: Palette) -> list[viser.SceneNodeHandle]:
         """Return the handles of the ellipse or ellipsoid of a number of σ."""
         style = {"color": palette.estimate, "opacity": {1: 0.28, 2: 0.16}[sigmas]}
         if not self.flat:
@@ -167,7 +165,7 @@ class BeliefScene:
         texts = [f"{100 * peak.weight:.0f} %" for peak in peaks]
         self._marks.draw(list(places + [0.0, 0.0, lift]), texts, (0.04, 0.04, 0.0))
 
-    def _put(self, handle: Any, states: np.ndarray) -> None:
+    def _put(self, handle: viser.PointCloudHandle, states: np.ndarray) -> None:
         """Draw the states that are in view as points."""
         places = self._place(states)
         places[:, 2] += 0.02 if self.flat else 0.0

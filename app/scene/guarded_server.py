@@ -100,7 +100,7 @@ class _Bounded(ServerConnection):
 def _guard(inner: Callable, secret: str) -> Callable:
     wanted = secret.encode()
 
-    def process_request(connection: Any, request: Request) -> Response | None:
+    def process_request(connection: ServerConnection, request: Request) -> Response | None:
         given = request.headers.get_all(HEADER)
         if len(given) == 1 and hmac.compare_digest(given[0].encode("utf-8", "surrogateescape"), wanted):
             return inner(connection, request)

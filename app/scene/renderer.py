@@ -6,25 +6,24 @@ import threading
 import time
 from collections.abc import Iterable
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any, Protocol
+from typing import Protocol
 
 import numpy as np
 import viser
 
+from config.schema import ViewSection
 from estimators.errors import ConfigError
 from estimators.model.state_space import StateSpaceModel
 
 from ..charts.colors import LIGHT, kinds
 from ..engine.copies import Belief
 from ..engine.running_fold import Running
+from ..result import JsonObject
 from .belief_scene import BeliefScene
 from .field_scenes import FieldScene, FieldSurfaceScene
 from .machine_scenes import BatteryScene, GripperScene, MotorScene
 from .scene import Cameras, History, Outlook
 from .vehicle_scene import VehicleScene
-
-if TYPE_CHECKING:
-    from config.schema import ViewSection
 
 BELIEF, FIELD, SURFACE = "belief", "field", "surface"
 VEHICLE, MOTOR, BATTERY, GRIPPER = "vehicle", "motor", "battery", "gripper"
@@ -223,7 +222,7 @@ class Choices:
                     raise ConfigError(f"scene: {value} is on the {other} axis already")
             self._values[key] = value
 
-    def json(self) -> list[dict[str, Any]]:
+    def json(self) -> list[JsonObject]:
         """Return the choices with their values, for the page."""
         values = self.values()
         return [

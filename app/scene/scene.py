@@ -103,29 +103,29 @@ class Shapes:
         """Return the same below another path."""
         return Shapes(self.api, f"{self.path}/{name}")
 
-    def frame(self, **more: Any) -> viser.FrameHandle:
+    def frame(self, **more: object) -> viser.FrameHandle:
         """Add a frame at the path; removing it removes all below."""
         return self.api.add_frame(self.path, show_axes=False, **more)
 
     def lines(
-        self, name: str, color: RGB, thickness: float, points: np.ndarray = NO_LINE, **more: Any
+        self, name: str, color: RGB, thickness: float, points: np.ndarray = NO_LINE, **more: object
     ) -> viser.LineSegmentsHandle:
         """Add line segments (n, 2, 3)."""
         path = f"{self.path}/{name}"
         return self.api.add_line_segments(path, points, color, thickness=thickness, thickness_units="screen", **more)
 
     def dots(
-        self, name: str, color: Any, size: float, points: np.ndarray = NO_POINT, shape: str = "circle", **more: Any
+        self, name: str, color: object, size: float, points: np.ndarray = NO_POINT, shape: str = "circle", **more: Any
     ) -> viser.PointCloudHandle:
         """Add points (n, 3) of one colour, or of a colour each."""
-        style: dict[str, Any] = {"precision": "float32", "point_shading": "flat", "point_shape": shape, **more}
+        style: dict[str, object] = {"precision": "float32", "point_shading": "flat", "point_shape": shape, **more}
         return self.api.add_point_cloud(f"{self.path}/{name}", points, color, point_size=size, **style)
 
-    def label(self, name: str, text: str = " ", scale: float = 0.75, **more: Any) -> viser.LabelHandle:
+    def label(self, name: str, text: str = " ", scale: float = 0.75, **more: object) -> viser.LabelHandle:
         """Add a text."""
         return self.api.add_label(f"{self.path}/{name}", text, font_screen_scale=scale, **more)
 
-    def body(self, kind: str, name: str, *form: Any, **more: Any) -> Any:
+    def body(self, kind: str, name: str, *form: object, **more: object) -> viser.MeshHandle:
         """Add a body of a kind of Viser's: box, cylinder, icosphere, mesh_simple, image."""
         return getattr(self.api, f"add_{kind}")(f"{self.path}/{name}", *form, **UNSHADED, **more)
 
@@ -136,13 +136,13 @@ def set_text(label: viser.LabelHandle, text: str) -> None:
         label.text = text
 
 
-def set_color(handle: Any, color: RGB) -> None:
+def set_color(handle: viser.MeshHandle, color: RGB) -> None:
     """Set a colour, and send it only if it is another one."""
     if tuple(handle.color) != tuple(color):
         handle.color = color
 
 
-def put_points(handle: Any, points: np.ndarray) -> None:
+def put_points(handle: viser.PointCloudHandle | viser.LineSegmentsHandle, points: np.ndarray) -> None:
     """Draw the finite ones of points (n, 3) or of lines (n, 2, 3); hide the handle without any."""
     points = points[np.isfinite(points).all(axis=tuple(range(1, points.ndim)))]
     handle.visible = bool(len(points))

@@ -14,6 +14,7 @@ import viser
 
 from estimators.log import READING, truth_of
 from estimators.model.state_space import StateSpaceModel
+from estimators.numerics.peaks import Peak
 from estimators.track import FAILED, GATED
 from estimators.tuning import Tuning
 
@@ -179,7 +180,7 @@ class VehicleScene:
         elif self._beams is not None:
             self._beams.hide()
 
-    def _draw_vehicle(self, plane: np.ndarray, peak: Any) -> None:
+    def _draw_vehicle(self, plane: np.ndarray, peak: Peak | Belief) -> None:
         """Move the vehicle with its ellipse, and the world under the camera."""
         here = peak.mean[self._plane]
         middle = here if self.follow or self._home is None else self._home
@@ -238,7 +239,7 @@ class VehicleScene:
                 parts.append(value[mine][:, rows])
             put_points(handle, _raised(np.concatenate(parts), 0.1))
 
-    def _draw_peaks(self, peaks: Sequence[Any]) -> None:
+    def _draw_peaks(self, peaks: Sequence[Peak]) -> None:
         # The vehicle and the end of its trail are at the heaviest.
         texts = [f"{100 * peak.weight:.0f} %{' drawn' if k == 0 else ''}" for k, peak in enumerate(peaks)]
         self._marks.draw([np.array([*peak.mean[self._plane], 1.2]) for peak in peaks], texts, (0.6, 0.6, 0.0))

@@ -12,7 +12,7 @@ from urllib.parse import parse_qs
 from estimators.diagnostics.references import shown_track
 
 from ..charts.colors import THEMES
-from ..engine.copies import MAX_PULL_ROWS
+from ..engine.copies import MAX_PULL_ROWS, Pull
 from ..engine.history_copy import follow
 from ..engine.jobs import LoopThread
 from ..engine.running_fold import Running
@@ -111,7 +111,7 @@ class ViserView:
             self._take(pull)
         return changed
 
-    def _take(self, pull: Any) -> None:
+    def _take(self, pull: Pull) -> None:
         if isinstance(self.renderer.scene, FIELD_SCENES):
             self.renderer.scene.update(pull)
         self.history.update(replace(pull, track=shown_track(self.engine.model, pull.track)))

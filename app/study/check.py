@@ -6,7 +6,7 @@ from collections import Counter
 from collections.abc import Iterable, Sequence
 from concurrent.futures import Executor
 from dataclasses import dataclass
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 
@@ -29,7 +29,7 @@ from estimators.fold import Fold
 from estimators.log import READING, Log
 from estimators.model.state_space import StateSpaceModel
 
-from ..result import WORSE, Bar, Cell, Topic, finite_text, plain
+from ..result import WORSE, Bar, Cell, JsonObject, Topic, finite_text, plain
 from ..twin.twin import Twin
 from .advice.draft import undecided_lines
 from .advice.measured import Measured, repeat_lines, repeats_of
@@ -186,7 +186,7 @@ def stamps(twin: Twin) -> str:
     return "every reading has the time at which it was measured"
 
 
-def figures(checked: Checked, checklist: Sequence[ChecklistLine]) -> dict[str, Any]:
+def figures(checked: Checked, checklist: Sequence[ChecklistLine]) -> JsonObject:
     """Return all figures of a check; times in seconds of the log, null where there is no number.
 
     `checklist`: question, answer (yes, partly, no, not told), figures, remedy. `observability`: the Gramian of the log
@@ -201,7 +201,7 @@ def figures(checked: Checked, checklist: Sequence[ChecklistLine]) -> dict[str, A
     twin, gramian, found, held = checked.twin, checked.gramian, checked.sensitivity, checked.held_out
     linearity, policy = checked.linearity, twin.policy
 
-    def view(part: GramianView) -> dict[str, Any]:
+    def view(part: GramianView) -> JsonObject:
         return {
             "begin": part.begin * 1e-9,
             "end": part.end * 1e-9,
@@ -213,7 +213,7 @@ def figures(checked: Checked, checklist: Sequence[ChecklistLine]) -> dict[str, A
             "weakest": part.text,
         }
 
-    integrity: dict[str, Any] = {"reason": found.reason, "states": {}}
+    integrity: JsonObject = {"reason": found.reason, "states": {}}
     if not found.reason:
         bounds = bounds_of(twin.model, found, *checked.onsets)
         integrity |= {
@@ -221,7 +221,7 @@ def figures(checked: Checked, checklist: Sequence[ChecklistLine]) -> dict[str, A
             "estimator": found.estimator,
             "states": {name: bound._asdict() | {"fault": bound.fault or None} for name, bound in bounds.items()},
         }
-    result: dict[str, Any] = plain(
+    result: JsonObject = plain(
         {
             "twin": twin.name,
             "estimator": twin.estimator,

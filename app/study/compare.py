@@ -5,7 +5,7 @@ from __future__ import annotations
 import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import replace
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 
@@ -214,7 +214,7 @@ def _spread(values: Sequence[float]) -> Spread:
     return Spread(float(np.mean(values)), float(np.std(values, ddof=1)) if len(values) > 1 else np.nan)
 
 
-_shared: dict[str, Any] = {}
+_shared: list[tuple[Twin, list[Events]]] = []
 """Twin and logs of a worker process."""
 
 
@@ -259,9 +259,9 @@ def compare(
 
 
 def _share(name: str, overrides: dict[str, str], logs: list[tuple[np.ndarray, ...]]) -> None:
-    _shared["twin"] = load_twin(name, overrides=overrides)
-    _shared["logs"] = [Events(*columns) for columns in logs]
+    _shared[:] = [(load_twin(name, overrides=overrides), [Events(*columns) for columns in logs])]
 
 
 def _fold(estimator: str, budget: float, scored: tuple[int, int] | None) -> FilterScore:
-    return fold_row(_shared["twin"], estimator, _shared["logs"], budget, scored)
+    twin, logs = _shared[0]
+    return fold_row(twin, estimator, logs, budget, scored)

@@ -3,9 +3,9 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
-from ..result import plain
+from ..result import JsonObject, plain
 
 if TYPE_CHECKING:
     from estimators.diagnostics.consistency import NisVerdict
@@ -16,7 +16,7 @@ HIGH_CORRELATION = 0.9
 """Correlation from which on two estimates are hardly identifiable separately."""
 
 
-def fit_json(fitted: Fitted) -> dict[str, Any]:
+def fit_json(fitted: Fitted) -> JsonObject:
     """Return a fit as JSON; null stands for a value that is not a number.
 
     `entries` have before and after, the 95 % interval, the change in deviations of the estimate (`sigma`), whether they
@@ -51,7 +51,7 @@ def fit_json(fitted: Fitted) -> dict[str, Any]:
     return dict(plain(found))
 
 
-def correlated(fitted: Fitted) -> list[dict[str, Any]]:
+def correlated(fitted: Fitted) -> list[JsonObject]:
     """Return pairs of entries that are hardly identifiable separately, the most correlated first."""
     found = [
         {"entries": [one.key, other.key], "correlation": float(fitted.correlation[i, j])}
@@ -62,7 +62,7 @@ def correlated(fitted: Fitted) -> list[dict[str, Any]]:
     return sorted(found, key=lambda pair: -abs(pair["correlation"]))
 
 
-def part_json(part: PartScore) -> dict[str, Any]:
+def part_json(part: PartScore) -> JsonObject:
     """Return the scores of one part of the recordings."""
     names = ("log_density", "nis", "coverage", "log_likelihood")
     found = {name: getattr(part, name) for name in names} | {"readings": part.n}
@@ -73,7 +73,7 @@ def part_json(part: PartScore) -> dict[str, Any]:
     return dict(plain(found))
 
 
-def nis_json(found: NisVerdict) -> dict[str, Any]:
+def nis_json(found: NisVerdict) -> JsonObject:
     """Return a verdict on a mean NIS: numbers per measurement, position and words."""
     return {
         "nis": found.nis,

@@ -7,7 +7,7 @@ from collections.abc import Iterable, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass
 from functools import cached_property
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 
@@ -44,7 +44,7 @@ from sources.source import WRONG_TIME
 from ..columns import units_by_name
 from ..format_time import counted, duration_text, format_time
 from ..leading import leading, states_of_rows
-from ..result import Figure, Topic, plain
+from ..result import Figure, JsonObject, Topic, plain
 from ..twin.ingest import dropped_episode
 from ..twin.twin import Twin
 from .calibration_lines import COVERAGE_HEAD, calibration_lines, coverage_rows, health_shares
@@ -228,7 +228,7 @@ def explained(fold: Fold, listed: Sequence[Episode]) -> list[ExplainedEpisode]:
     return found
 
 
-def fold_json(result: FoldResult) -> dict[str, Any]:
+def fold_json(result: FoldResult) -> JsonObject:
     """Return a fold for scripts; docs/reference.md describes its fields."""
     twin, fold, scored, counts = result.twin, result.fold, result.scored, result.counts
     smoothing = result.smoothing
@@ -288,7 +288,7 @@ def fold_json(result: FoldResult) -> dict[str, Any]:
     return plain(found)  # type: ignore[no-any-return]
 
 
-def _grades(result: FoldResult) -> dict[str, dict[str, Any]]:
+def _grades(result: FoldResult) -> dict[str, JsonObject]:
     """Return grade and reason of each state at the end, and the share of time of each grade."""
     model, track, events, policy = result.twin.model, result.track, result.events, result.fold.policy
     if not len(track):
@@ -316,13 +316,13 @@ def _errors(states: Mapping[str, Fit]) -> dict[str, dict[str, float]]:
     }
 
 
-def calibration_json(entry: Calibration) -> dict[str, Any]:
+def calibration_json(entry: Calibration) -> JsonObject:
     """Return one calibration for JSON, its coverage by band."""
     coverage = {f"{100 * band:.0f}": share for band, share in zip(BANDS, entry.coverage, strict=True)}
     return {**plain(entry), "coverage": plain(coverage)}
 
 
-def _episode_json(item: ExplainedEpisode) -> dict[str, Any]:
+def _episode_json(item: ExplainedEpisode) -> JsonObject:
     named = [
         {
             "kind": suspect.nudge.kind,

@@ -9,7 +9,6 @@ import math
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 
@@ -20,6 +19,7 @@ from sources.inspect import Message, RecordingContents, SignalSeries, inspect_re
 from sources.tables.rows import names_of
 from sources.tables.times import TimeColumn
 
+from ..result import JsonObject
 from .advice.draft import write_draft
 from .advice.draft_fit import DraftStep, fit_plan
 from .advice.plan import OMITTED, SENSOR, STATE, DraftPlan, Roles, SignalRole, plan
@@ -102,7 +102,7 @@ class LogOverview:
     keys: list[tuple[BusName, int]] = field(default_factory=list)
     curves: list[Curve] = field(default_factory=list)
 
-    def as_json(self) -> dict[str, Any]:
+    def as_json(self) -> JsonObject:
         """Return the overview without paths, keys and curves."""
         hidden = ("file", "used", "keys", "curves", "start_ns")
         parts = {key: value for key, value in vars(self).items() if key not in hidden}

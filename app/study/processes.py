@@ -8,7 +8,7 @@ import signal
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from concurrent.futures import Executor, Future, ProcessPoolExecutor, as_completed
 from contextlib import AbstractContextManager, contextmanager, nullcontext
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, TypeVar
 
 import numba
 
@@ -18,6 +18,8 @@ from estimators.errors import ConfigError
 
 if TYPE_CHECKING:
     from ..twin.twin import Twin
+
+T = TypeVar("T")
 
 
 def jobs_of(given: int | None, most: int) -> int:
@@ -32,14 +34,14 @@ def jobs_of(given: int | None, most: int) -> int:
 
 
 def results(
-    work: Callable[..., Any],
-    calls: Sequence[tuple[Any, ...]],
+    work: Callable[..., T],
+    calls: Sequence[tuple[object, ...]],
     *,
     jobs: int | None = None,
     cluster: str | None = None,
     begin: Callable[..., None] | None = None,
-    given: tuple[Any, ...] = (),
-) -> Iterator[tuple[int, Any]]:
+    given: tuple[object, ...] = (),
+) -> Iterator[tuple[int, T]]:
     """Call `work` with each of `calls`, its arguments; yield index and result of each as it is done.
 
     Each process has one thread of Numba. The results are the same bits for any number of processes.
@@ -91,9 +93,8 @@ def executor_of(
     return nullcontext("threads") if cluster is None else _elsewhere("folds", cluster, twin, held, name, overrides)
 
 
-def _elsewhere(kind: str, cluster: str, *given: Any) -> AbstractContextManager[Any]:
-    found: AbstractContextManager[Any] = maker("executors", kind, f"--cluster {cluster}", "cluster")(cluster, *given)
-    return found
+def _elsewhere(kind: str, cluster: str, *given: object) -> AbstractContextManager[Any]:
+    return maker("executors", kind, f"--cluster {cluster}", "cluster")(cluster, *given)
 
 
 class _Deaf:
@@ -102,7 +103,7 @@ class _Deaf:
     def __init__(self, pool: Executor) -> None:
         self._pool = pool
 
-    def submit(self, work: Callable[..., Any], *call: Any) -> Future[Any]:
+    def submit(self, work: Callable[..., T], *call: object) -> Future[T]:
         """Submit a call, for which a process may be started."""
         with deaf():
             return self._pool.submit(work, *call)
@@ -146,6 +147,6 @@ def _begin_child(begin: Callable[..., None], *given: Any) -> None:
     _begin(begin, *given)
 
 
-def _begin(begin: Callable[..., None], *given: Any) -> None:
+def _begin(begin: Callable[..., None], *given: object) -> None:
     begin(*given)
     numba.set_num_threads(1)  # the processors have a call each, and a step costs what it costs one

@@ -7,12 +7,14 @@ import io
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 
 from config.loader import TWINS
 from config.yaml_files import writing
+
+from ..result import JsonObject
 
 if TYPE_CHECKING:
     from estimators.diagnostics.field_pictures import Picture
@@ -234,10 +236,10 @@ def read_scores(twin: Path) -> list[dict[str, str]]:
         return []
 
 
-def row_json(row: FilterScore) -> dict[str, Any]:
+def row_json(row: FilterScore) -> JsonObject:
     """Return a row for scripts: every figure is its mean, with the standard deviations under `spread`."""
-    figures: dict[str, Any] = {"rmse": {unit: figure.value for unit, figure in row.rmse.items()}}
-    spreads: dict[str, Any] = {"rmse": {unit: figure.spread for unit, figure in row.rmse.items()}}
+    figures: JsonObject = {"rmse": {unit: figure.value for unit, figure in row.rmse.items()}}
+    spreads: JsonObject = {"rmse": {unit: figure.spread for unit, figure in row.rmse.items()}}
     for name in ("nis", "coverage"):
         figures[name], spreads[name] = getattr(row, name)
     return {**asdict(row), **figures, "spread": spreads}

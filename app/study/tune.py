@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import Any
 
 import numpy as np
 
@@ -17,7 +16,7 @@ from estimators.fit.judge import PartScore, PredictionScore, Worth
 from estimators.fit.objective import FitProgress
 from estimators.registry import find_estimator
 
-from ..result import Topic, finite_text
+from ..result import JsonObject, Topic, finite_text
 from ..twin.twin import Twin
 from .fit_json import correlated, fit_json
 
@@ -26,9 +25,9 @@ MINUTES_FROM_S = 100.0  # remaining time from which it is given in minutes
 MIN_UNFITTED_SHARE = 0.05  # share of a window above which an unfitted end of a log is reported
 
 
-def window_json(recording: int, refit: WindowFit, origin: int) -> dict[str, Any]:
+def window_json(recording: int, refit: WindowFit, origin: int) -> JsonObject:
     """A window as JSON: `from` and `to` in seconds after the recording's first event, and the fit as `nisus tune`."""
-    told: dict[str, Any] = {
+    told: JsonObject = {
         "recording": recording,
         "from": (refit.start - origin) * 1e-9,
         "to": (refit.end - origin) * 1e-9,

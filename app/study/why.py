@@ -3,14 +3,13 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import Any
 
 import numpy as np
 
 from estimators.attribution import Attribution
 from estimators.model.state_space import StateSpaceModel
 
-from ..result import Cell, TableColumn, Topic
+from ..result import Cell, JsonObject, TableColumn, Topic
 
 MODEL, RESTARTS = "model", "restarts"
 """Causes that are neither an input nor a sensor."""
@@ -29,7 +28,7 @@ def causes(model: StateSpaceModel, found: Attribution) -> list[tuple[str, str, i
     return [(MODEL, MODEL, None, found.model), *inputs, *sensors, (RESTARTS, RESTARTS, None, found.restarts)]
 
 
-def why_json(model: StateSpaceModel, found: Attribution, origin: int) -> dict[str, Any]:
+def why_json(model: StateSpaceModel, found: Attribution, origin: int) -> JsonObject:
     """Return the changes by state; times in seconds after `origin`, ns."""
     listed = causes(model, found)
     return {

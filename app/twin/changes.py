@@ -13,6 +13,8 @@ from estimators.model.state_space import StateSpaceModel
 from estimators.registry import ESTIMATORS
 from estimators.tuning import GATE_KEYS, SHARED_ENTRY_ROWS, Tuning
 
+from ..result import JsonObject
+
 if TYPE_CHECKING:
     from .twin import Twin
 
@@ -30,7 +32,7 @@ class SettingChange(NamedTuple):
     after: float | bool | str | None
 
 
-def turned(twin: Twin, estimator: str, tuning: Tuning) -> dict[str, Any]:
+def turned(twin: Twin, estimator: str, tuning: Tuning) -> JsonObject:
     """Return the entries that differ from those of the twin, with the twin's values."""
     return {change.key: change.before for change in difference(twin.estimator, twin.tuning, estimator, tuning)}
 
@@ -116,7 +118,7 @@ def obstacle(before: Twin, after: Twin, *, from_prior: bool = False) -> str | No
     return next(iter([*changed, *(f"its `{name}` changed" for name in sections)]), None)
 
 
-def shape(model: StateSpaceModel, *, considered: bool = True) -> Mapping[str, Any]:
+def shape(model: StateSpaceModel, *, considered: bool = True) -> Mapping[str, object]:
     """Return everything that logs, tracks, tunings and charts of a model are laid out by; `considered` states too."""
     field = model.grid
     states = model.states if considered else model.states[: model.nx - model.considered]

@@ -84,7 +84,9 @@ def one_each(loaded: Loaded, key: Key, values: tuple, rows: list[str]) -> tuple:
     return values
 
 
-def check_names(loaded: Loaded, key: Key, given: Any, known: Any, kind: str, model: StateSpaceModel) -> None:
+def check_names(
+    loaded: Loaded, key: Key, given: Iterable[str], known: Collection[str], kind: str, model: StateSpaceModel
+) -> None:
     """Refuse a name under `key` that the model does not have.
 
     Raises:
@@ -101,7 +103,7 @@ def estimated_names(model: StateSpaceModel) -> Sequence[str]:
     return names[: model.nx - model.considered] if model.considered else names
 
 
-def check_named(loaded: Loaded, key: Key, names: Any, model: StateSpaceModel) -> None:
+def check_named(loaded: Loaded, key: Key, names: Iterable[str], model: StateSpaceModel) -> None:
     """Refuse a state that the value at `key` names and the model does not estimate.
 
     Raises:

@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import math
 from collections import deque
-from collections.abc import Callable, Iterator, Mapping, Sequence
-from typing import Any, NamedTuple
+from collections.abc import Callable, Iterator, Sequence
+from typing import NamedTuple
 
 import numpy as np
 
@@ -17,6 +17,8 @@ from estimators.events.maintenance import maintained
 from estimators.log import BEFORE, INPUT, READING, TICK, Events
 from estimators.model.state_space import StateSpaceModel
 from sources.source import WRONG_TIME, Report
+
+from ..result import JsonObject
 
 CLOCK_MOVED = "clock moved"  # key of jumps of a source's clock
 MAINTENANCE = "maintenance"  # key of maintenance
@@ -100,12 +102,12 @@ class Ingest:
             (events.arrival, events.arrival[:0]) if guard is None else (events.arrival - guard.set_back, guard.waiting)
         )
 
-    def state(self) -> dict[str, Any]:
+    def state(self) -> JsonObject:
         """Return a copy of the state for `restore`, of arrays, lists and numbers."""
         guard = None if self._guard is None else self._guard.state()
         return {"newest": self._newest, "periods": [*self._periods], "guard": guard}
 
-    def restore(self, state: Mapping[str, Any], newest: int) -> None:
+    def restore(self, state: JsonObject, newest: int) -> None:
         """Continue from the `state` of another; `newest` is the time of the log's newest event, ns.
 
         Raises:

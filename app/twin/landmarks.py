@@ -63,7 +63,7 @@ def _merged(common: SensorSection, own: SensorSection | None) -> SensorSection:
     """Return the section of a member: its own entries in place of those of the family."""
     if own is None:
         return common
-    update: dict[str, Any] = {name: getattr(own, name) for name in own.model_fields_set}
+    update: dict[str, object] = {name: getattr(own, name) for name in own.model_fields_set}
     if {"std", "variance"} & update.keys():
         update = {"std": None, "variance": None} | update
     return common.model_copy(update=update)
@@ -71,7 +71,7 @@ def _merged(common: SensorSection, own: SensorSection | None) -> SensorSection:
 
 def _of_source(loaded: Loaded, key: Key, section: Any, members: Mapping[str, list[str]]) -> Any:
     """Return a section of the source, or of its parts or its asset, with channels or plans of the members."""
-    update: dict[str, Any] = {}
+    update: dict[str, object] = {}
     if getattr(section, "parts", None):
         update["parts"] = tuple(
             _of_source(loaded, (*key, "parts", k), part, members) for k, part in enumerate(section.parts)
@@ -107,7 +107,7 @@ def _of_source(loaded: Loaded, key: Key, section: Any, members: Mapping[str, lis
     return section.model_copy(update=update)
 
 
-def _members(loaded: Loaded, place: Key, item: ChannelSection, family: str, names: list[str]) -> dict[str, Any]:
+def _members(loaded: Loaded, place: Key, item: ChannelSection, family: str, names: list[str]) -> dict[str, object]:
     """Return the channels of the members, which select the rows of their landmark."""
     ids = {name.removeprefix(f"{family}_"): name for name in names}
     if isinstance(item.landmark_column, str):
@@ -129,7 +129,7 @@ def _members(loaded: Loaded, place: Key, item: ChannelSection, family: str, name
 def _with_id(item: ChannelSection, landmark: str) -> ChannelSection:
     """Return the channel of a member, whose columns or signals have its id in place of *."""
     named = "signals" if isinstance(item, SignalSection) else "columns"
-    update: dict[str, Any] = {named: tuple(name.replace("*", landmark) for name in item.names())}
+    update: dict[str, object] = {named: tuple(name.replace("*", landmark) for name in item.names())}
     if isinstance(item, SignalSection):
         update["message"] = item.message.replace("*", landmark)
     return item.model_copy(update=update)

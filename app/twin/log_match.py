@@ -5,10 +5,11 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 from config.loader import Loaded
-from config.source_schema import TableSection
+from config.source_schema import CanSection, TableSection
+from config.yaml_files import Key
 from estimators.errors import SourceError, nearest
 from estimators.log import TRUTH
 from estimators.model.state_space import StateSpaceModel
@@ -140,7 +141,7 @@ def _of_table(part: TableSection, named: list[Channel], header: LogHeader) -> tu
 
 
 def _of_frames(
-    loaded: Loaded, part: Any, key: Any, named: list[Channel], header: LogHeader
+    loaded: Loaded, part: CanSection, key: Key, named: list[Channel], header: LogHeader
 ) -> tuple[str | None, list[str | None]]:
     """Return the reason why frames cannot be read, and for each channel what it lacks."""
     from sources.can.decoder import find_messages, same_bus, shown_id

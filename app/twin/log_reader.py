@@ -4,12 +4,12 @@ from __future__ import annotations
 
 from collections import Counter
 from collections.abc import Callable, Mapping
-from typing import TYPE_CHECKING
 
 import numpy as np
 
 from config.source_schema import SimulatorSection
 from estimators.errors import ConfigError, SourceError
+from estimators.events.clocks import Passed
 from estimators.late import inflated
 from estimators.log import TRUTH, Log
 from sources.messages import FORGOTTEN, NO_BROKER, REFUSED_MESSAGE, REFUSED_TOPIC
@@ -20,9 +20,6 @@ from sources.tables.text import UNREADABLE
 from ..terminal import complain
 from .ingest import CLOCK_MOVED, UNSET, Ingest
 from .twin import Twin, load_twin
-
-if TYPE_CHECKING:
-    from estimators.events.clocks import Passed
 
 REMARKS = (*ORDER, NEVER, TRUNCATED, CLOCK_MOVED, UNSET)
 

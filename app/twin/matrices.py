@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 
@@ -58,7 +57,7 @@ def matrices_model(loaded: Loaded, section: MatricesSection, path: Path) -> Stat
     return model
 
 
-def _read(path: Path, loaded: Loaded) -> Mapping[str, Any]:
+def _read(path: Path, loaded: Loaded) -> Mapping[str, object]:
     """Return the arrays of a file by name."""
     try:
         if path.suffix == ".npz":
@@ -76,7 +75,7 @@ def _read(path: Path, loaded: Loaded) -> Mapping[str, Any]:
     raise loaded.error(("model", "matrices"), f"is {path.name!r}; it must be a .mat or a .npz file")
 
 
-def _matrix(arrays: Mapping[str, Any], letter: str, key: str, path: Path, loaded: Loaded) -> np.ndarray:
+def _matrix(arrays: Mapping[str, object], letter: str, key: str, path: Path, loaded: Loaded) -> np.ndarray:
     """Return a matrix of the file as real numbers of two dimensions."""
     if key not in arrays:
         rule = nearest(key, arrays) if arrays else "it has no arrays"
@@ -84,7 +83,7 @@ def _matrix(arrays: Mapping[str, Any], letter: str, key: str, path: Path, loaded
             ("model", "keys", letter), f"is {key!r}; {shown_path(path)} has no array of that name; {rule}"
         )
     try:
-        value = np.asarray(arrays[key].toarray() if hasattr(arrays[key], "toarray") else arrays[key])
+        value = np.asarray(getattr(arrays[key], "toarray", lambda: arrays[key])())
         if value.dtype.kind not in "biuf" or value.ndim > 2 or value.size == 0:
             raise TypeError
     except (TypeError, ValueError):

@@ -9,7 +9,7 @@ from dataclasses import replace
 from math import inf, log, sqrt
 from pathlib import Path
 from types import ModuleType
-from typing import Any
+from typing import Any, TypeVar
 
 import numpy as np
 
@@ -35,6 +35,8 @@ from .defaults import instrument_sections, parameter_sections
 from .landmarks import expanded
 from .matrices import matrices_model
 from .sources.kind import signal_ends
+
+T = TypeVar("T")
 
 
 def find_model(loaded: Loaded, key: Key, reference: Model) -> StateSpaceModel:
@@ -104,7 +106,7 @@ def _import(path: Path) -> ModuleType:
         raise _blame(error, path) from error
 
 
-def _as_model(found: Any, name: str, path: Path, loaded: Loaded, key: Key) -> StateSpaceModel:
+def _as_model(found: object, name: str, path: Path, loaded: Loaded, key: Key) -> StateSpaceModel:
     if not isinstance(found, StateSpaceModel) and callable(found):
         try:
             found = found()
@@ -268,7 +270,7 @@ def _instruments(model: StateSpaceModel, loaded: Loaded) -> dict[str, dict[str, 
     return found
 
 
-def _instrument_keys(config: TwinSection, found: Mapping[str, Mapping[str, Any]]) -> dict[str, Key]:
+def _instrument_keys(config: TwinSection, found: Mapping[str, Mapping[str, object]]) -> dict[str, Key]:
     """Return the keys at which the YAML has the offsets and scales, by their parameters."""
     return {
         item: ("inputs" if name in config.inputs else "sensors", name, item.rpartition("_")[2])
@@ -398,7 +400,7 @@ def _ranged(items: Any, loaded: Loaded) -> Any:
     )
 
 
-def _sensor(sensor: Any, loaded: Loaded) -> Any:
+def _sensor(sensor: Sensor, loaded: Loaded) -> Sensor:
     section = loaded.config.sensors.get(sensor.name, SensorSection())
     if section.correlation is not None:
         sensor = replace(sensor, correlation=_correlation(sensor, section.correlation, loaded))
@@ -411,7 +413,7 @@ def _sensor(sensor: Any, loaded: Loaded) -> Any:
     return replace(sensor, limits=limits_of(sensor, section, loaded), by_chance=by_chance)
 
 
-def _correlation(sensor: Any, given: Correlation, loaded: Loaded) -> Correlation | None:
+def _correlation(sensor: Sensor, given: Correlation, loaded: Loaded) -> Correlation | None:
     """Return the correlation of a sensor's rows; None if they are independent."""
     wrong = correlation_error(given, len(sensor.rows))
     if wrong:
@@ -489,7 +491,7 @@ def _contradiction(limits: Limits, sensor: Sensor) -> str | None:
     return None
 
 
-def _of_row(values: tuple[Any, ...], k: int, default: Any) -> Any:
+def _of_row(values: tuple[T, ...], k: int, default: T) -> T:
     """Return the entry of row k, from one for all rows or one a row."""
     return values[k % len(values)] if values else default
 

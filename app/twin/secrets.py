@@ -34,7 +34,7 @@ def secrets_of(outputs: Any, places: ValuePlaces) -> Secrets:
     Raises:
         ConfigError: If one is not set.
     """
-    sections: dict[tuple[str, ...], Any] = {(key,): getattr(outputs, key) for key in type(outputs).model_fields}
+    sections: dict[tuple[str, ...], object] = {(key,): getattr(outputs, key) for key in type(outputs).model_fields}
     sections |= {("receivers", name): section for name, section in outputs.receivers.items()}
     found: dict[str, str] = {}
     for key, section in sections.items():

@@ -17,6 +17,7 @@ from estimators.model.state_space import Field, Input, State, StateSpaceModel
 from estimators.registry import find_entry
 from estimators.tuning import REOPEN_S, Tuning
 
+from ..result import JsonObject
 from .defaults import bounds_of, parameter_sections
 
 if TYPE_CHECKING:
@@ -64,7 +65,7 @@ def tuning_yaml(
     turned = {name: value for name, value in values.items() if name in config.parameters or value != known[name]}
     given = {name: section.model_dump(mode="json", exclude_unset=True) for name, section in config.parameters.items()}
     # A version replaces another, so it has the widths that are not the fit's too.
-    parameters: dict[str, Any] = {
+    parameters: JsonObject = {
         name: item
         for name, item in given.items()
         if whole or (set(item) - {"value"} and config.parameters[name].role != "estimated")
@@ -93,7 +94,7 @@ def tuning_yaml(
         {name: {"variance": _within(q, ranges.get(f"Q.{name}")), **over.get(name, {})} for name, q in noises.items()},
     )
     lines += as_section("sensors", _sensors(config, tuning, errors, values, whole))
-    gate: Any = tuning.gate
+    gate: float | dict[str, object] | None = tuning.gate
     if gate is not None and (tuning.gate_kind != "hard" or tuning.reopen != REOPEN_S):
         reopen = "never" if tuning.reopen is None else tuning.reopen
         gate = {"probability": gate, "kind": tuning.gate_kind, "reopen": reopen}
@@ -111,7 +112,7 @@ def with_spread(config: TwinSection, model: StateSpaceModel, widths: ParameterWi
     return [name for name in widths.names if name in sections and sections[name].std is not None]
 
 
-def _add_widths(parameters: dict[str, Any], widths: ParameterWidths, spread: Sequence[str]) -> None:
+def _add_widths(parameters: JsonObject, widths: ParameterWidths, spread: Sequence[str]) -> None:
     """Add the widths of a fit to the section `parameters`: for those of `spread` that between specimens."""
     for i, name in enumerate(widths.names):
         own = parameters.setdefault(name, {})
@@ -127,7 +128,7 @@ def _add_widths(parameters: dict[str, Any], widths: ParameterWidths, spread: Seq
 
 def _fitted_ranges(
     config: TwinSection, model: StateSpaceModel, widths: ParameterWidths | None
-) -> dict[str, dict[str, Any]]:
+) -> dict[str, JsonObject]:
     """Return the section `valid_range`: of each state and input that has one or widens a parameter."""
     sections = config.valid_range.items()
     found = {name: section.model_dump(mode="json", exclude_unset=True) for name, section in sections}
@@ -149,10 +150,10 @@ def _sensors(
     errors: Mapping[str, list[float]],
     values: Mapping[str, float],
     whole: bool,
-) -> dict[str, Any]:
+) -> JsonObject:
     """Return the section `sensors`, given the variances of coloured errors by sensor, and parameters by name."""
     landmarks = {name: section.landmarks for name, section in config.sensors.items() if section.landmarks and whole}
-    found: dict[str, Any] = {
+    found: JsonObject = {
         name: {"landmarks": {key: list(at) for key, at in given.items()}} for name, given in landmarks.items()
     }
     ranges = bounds_of(config, tuning.model)
@@ -177,7 +178,7 @@ def _one_or_all(values: list[float]) -> float | list[float]:
     return values[0] if all(value == values[0] for value in values) else values
 
 
-def _within(value: float | list[float], bounds: tuple[float, float] | None) -> Any:
+def _within(value: float | list[float], bounds: tuple[float, float] | None) -> object:
     """Return a variance with the range of its data sheet, unless it lies outside."""
     values = value if isinstance(value, list) else [value]
     if bounds is None or not all(bounds[0] <= item <= bounds[1] for item in values):
@@ -212,7 +213,7 @@ def with_tuning(text: str, before: str, after: str) -> str:
     return text
 
 
-def _leaves(value: Any, key: Key) -> Iterator[tuple[Key, Any]]:
+def _leaves(value: object, key: Key) -> Iterator[tuple[Key, object]]:
     """Return the values of a section by their keys; a list is a value."""
     if not isinstance(value, Mapping):
         yield key, value
@@ -221,7 +222,7 @@ def _leaves(value: Any, key: Key) -> Iterator[tuple[Key, Any]]:
         yield from _leaves(item, (*key, name))
 
 
-def _placed(data: Any, key: Key, value: Any) -> tuple[Key, Any]:
+def _placed(data: object, key: Key, value: Any) -> tuple[Key, Any]:
     """Return the key under which a file has a value, with the value as it stands there."""
     found: list[str | int] = []
     for name in key:

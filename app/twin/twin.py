@@ -8,7 +8,7 @@ from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from functools import cached_property
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 
@@ -28,6 +28,7 @@ from estimators.log import Log
 from estimators.model.state_space import StateSpaceModel
 from estimators.registry import checked, find_entry, find_estimator
 from estimators.tuning import CHANGED_MARK, Tuning
+from sources.source import Report, Source
 
 from .checks import check_named, check_names, check_outputs, check_refit, check_scene, commissioned
 from .defaults import DegradedAfter, Late, degraded_after, driven_states, late_policy, parameter_sections
@@ -35,9 +36,6 @@ from .ingest import Planned, UnknownInputs
 from .landmarks import expanded
 from .model import configure, find_model, model_files
 from .source import Plan, plan_source
-
-if TYPE_CHECKING:
-    from sources.source import Report, Source
 
 VERSION = "tuning"
 """The key among the overrides that names a tuning version."""

@@ -7,7 +7,7 @@ import time
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import numpy as np
 
@@ -17,17 +17,18 @@ from config.old_names import rewrite
 from config.tunings import OWN_VALUES, Version, check_name, folders, load_version, version_files, version_of
 from config.yaml_files import as_section, rounded, shown_path, with_section, writing
 from estimators.diagnostics.health import PROBABILITY
-from estimators.diagnostics.score import Score
+from estimators.diagnostics.score import Fit, Score
 from estimators.errors import LARGEST, ConfigError
 from estimators.registry import find_estimator
 from estimators.tuning import Tuning
 
+from ..result import JsonObject
 from .tuning_yaml import tuning_yaml, with_spread, with_tuning
 from .twin import Twin
 
 if TYPE_CHECKING:
     from estimators.fit.fit import Fitted
-    from estimators.fit.judge import PartScore
+    from estimators.fit.judge import PartScore, PredictionScore
     from estimators.fit.uncertainty import ParameterWidths
 
 NIS, LIKELIHOOD, RMSE, COVERAGE, REFUSED = "nis", "log_likelihood", "rmse", "coverage", "refused"
@@ -66,14 +67,14 @@ def write_section(path: Path, key: str, section: str) -> None:
     rewrite(path, lambda text: with_section(text, key, section), path)
 
 
-def listing(twin: Twin) -> list[dict[str, Any]]:
+def listing(twin: Twin) -> list[JsonObject]:
     """Return the twin's own settings and its versions, the oldest first.
 
     Each has `name`, `estimator`, `holds` (whether guards use it) and the head of its file; a file that cannot be read
     has `name` and `error`.
     """
     versions: list[Version] = []
-    broken: list[dict[str, Any]] = []
+    broken: list[JsonObject] = []
     for name, path in version_files(twin.path).items():
         try:
             versions.append(load_version(path))
@@ -82,9 +83,7 @@ def listing(twin: Twin) -> list[dict[str, Any]]:
     versions.sort(key=lambda version: (version.head.saved, version.name))
     accepted = last_accepted(versions)
     own = twin.loaded.without or twin.loaded
-    found: list[dict[str, Any]] = [
-        {"name": OWN_VALUES, "estimator": own.config.estimator.name, "holds": accepted is None}
-    ]
+    found: list[JsonObject] = [{"name": OWN_VALUES, "estimator": own.config.estimator.name, "holds": accepted is None}]
     for version in versions:
         estimator = version.section.estimator or own.config.estimator
         head = version.head.model_dump(mode="json")
@@ -137,7 +136,7 @@ def _finite(known: Mapping[str, float]) -> dict[str, float]:
     return {name: float(value) for name, value in known.items() if np.isfinite(value)}
 
 
-def _fits(items: Mapping[str, Any], rms: str) -> dict[str, float]:
+def _fits(items: Mapping[str, Fit | PredictionScore], rms: str) -> dict[str, float]:
     """Return RMSE (the field `rms`) and coverage of each item."""
     errors = {f"{RMSE}.{name}": getattr(item, rms) for name, item in items.items()}
     return errors | {f"{COVERAGE}.{name}": item.coverage for name, item in items.items()}
@@ -236,7 +235,7 @@ def now() -> str:
     return time.strftime("%Y-%m-%dT%H:%M:%SZ", time.gmtime())
 
 
-def verdicts(twin: Path) -> list[dict[str, Any]]:
+def verdicts(twin: Path) -> list[JsonObject]:
     """Return the last verdict of `nisus guard` on each recording, newest first; none if the file is damaged or missing.
 
     Each has `recording`, `at` (UTC), `version` (tuning), `figures` (number), `worse` and `better` (a line each) and

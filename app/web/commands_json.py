@@ -6,7 +6,6 @@ import dataclasses
 import os
 import typing
 from pathlib import Path
-from typing import Any
 
 from pydantic import TypeAdapter
 
@@ -15,6 +14,7 @@ from estimators.errors import ConfigError, nearest
 from ..engine import commands
 from ..engine.engine import Engine
 from ..engine.execute import prepared
+from ..result import JsonObject
 from .http import parse, shown
 
 MAX_NAME_BYTES = 255
@@ -23,7 +23,7 @@ MAX_NAME_BYTES = 255
 COMMANDS = {kind.__name__: kind for kind in typing.get_args(commands.Command)}
 
 
-def command_from_json(body: Any, engine: Engine) -> commands.Command:
+def command_from_json(body: object, engine: Engine) -> commands.Command:
     """Return the command of `{"command": NAME, field: value, ...}`.
 
     Raises:
@@ -61,7 +61,7 @@ def _recording(name: str) -> Path:
     return path
 
 
-def commands_schema() -> dict[str, Any]:
+def commands_schema() -> JsonObject:
     """Return the JSON Schema of the body of a command."""
     kinds = []
     for name, kind in COMMANDS.items():

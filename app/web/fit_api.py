@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import replace
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 from starlette.routing import Route
 
@@ -13,6 +13,7 @@ from ..derive.refits import FITTING, STOPPING, FitAttempt, Fitting, LiveRefit, R
 from ..engine.engine import Engine
 from ..engine.history_copy import copy_log
 from ..engine.jobs import Job
+from ..result import JsonObject
 from ..twin.versions import keep, settings_of, version_text
 from .http import get, one_line, post
 from .runs_api import checked_note
@@ -47,7 +48,7 @@ class FitApi:
             post("/api/refit/dismiss", self._dismiss),
         ]
 
-    def _fit(self) -> Any:
+    def _fit(self) -> JsonObject:
         """Return the last fit; `available` events could be fitted, `current` says whether its tuning still runs."""
         engine, attempt = self._engine, self.fitting.latest
         available = {"available": engine.end() - engine.rows(0, 0).first}
@@ -55,19 +56,19 @@ class FitApi:
             return {"state": "none"} | available
         return _attempt_json(attempt) | available | {"current": engine.folded_with()[0] is attempt.tuning}
 
-    def _begin(self, wanted: list[str], events: int | None = None) -> Any:
+    def _begin(self, wanted: list[str], events: int | None = None) -> JsonObject:
         """Fit the entries `wanted`, such as Q or R.winding, to the last `events`; None is all."""
         if events is not None and events < 1:
             raise ConfigError(f"fit: events is {events}; it must be a positive whole number, or be left out for all")
         self.fitting.begin(list(dict.fromkeys(wanted)), events)
         return self._fit()
 
-    def _cancel(self) -> Any:
+    def _cancel(self) -> JsonObject:
         """End the search of the fit under way; its best values so far are the result."""
         self.fitting.cancel()
         return self._fit()
 
-    def _keep(self, name: str, note: str) -> Any:
+    def _keep(self, name: str, note: str) -> JsonObject:
         """Keep the fitted values as a tuning version, with their scores on the blocks held out."""
         twin, attempt = self._engine.twin, self.fitting.latest
         if attempt is None or attempt.fitted is None:
@@ -78,7 +79,7 @@ class FitApi:
         keep(twin, name, version_text(twin, settings))
         return {"name": name}
 
-    def _advice(self) -> Any:
+    def _advice(self) -> JsonObject:
         """Return the advice, or the state of its search."""
         found, job = self._advising, self._advising.job
         current = found.revision == self._engine.revisions.runs[-1].number
@@ -86,12 +87,12 @@ class FitApi:
         known = {"state": state, "revision": found.revision, "current": current, "reason": reason}
         return known | {"progress": found.progress()} | ({"advice": found.advice} if found.advice else {})
 
-    def _advise(self) -> Any:
+    def _advise(self) -> JsonObject:
         """Begin to search the estimator that suits the log."""
         self._advising.begin()
         return self._advice()
 
-    def _cancel_advice(self) -> Any:
+    def _cancel_advice(self) -> JsonObject:
         """Cancel the search; the advice before it stays."""
         if self._advising.job is not None:
             self._advising.job.cancel()
@@ -99,14 +100,14 @@ class FitApi:
 
     # Dual estimation
 
-    def brief(self) -> dict[str, Any] | None:
+    def brief(self) -> JsonObject | None:
         """Return for the status: the last fit of a window, its state, and the proposed one; None without `refit`."""
         if self._refits.section is None:
             return None
         last, proposed = next(reversed(self._refits.known), None), self._refits.open
         return {"last": last and last.number, "state": last and last.state, "proposed": proposed and proposed.number}
 
-    def _refit(self) -> Any:
+    def _refit(self) -> JsonObject:
         """Return the YAML's section, the time of the next fit, and every fit, newest first."""
         refits, section, due = self._refits, self._refits.section, self._refits.due
         return {
@@ -115,22 +116,22 @@ class FitApi:
             "fits": [_refit_json(item) for item in reversed(refits.known)],
         }
 
-    def _refit_now(self) -> Any:
+    def _refit_now(self) -> JsonObject:
         """Fit the last window at once."""
         self._refits.now()
         return self._refit()
 
-    def _accept(self, number: int) -> Any:
+    def _accept(self, number: int) -> JsonObject:
         """Keep a proposed fit as a tuning version, and load it."""
         return {"name": self._refits.accept(number)}
 
-    def _dismiss(self, number: int) -> Any:
+    def _dismiss(self, number: int) -> JsonObject:
         """Dismiss a proposed fit."""
         self._refits.dismiss(number)
         return self._refit()
 
 
-def _attempt_json(attempt: FitAttempt) -> dict[str, Any]:
+def _attempt_json(attempt: FitAttempt) -> JsonObject:
     """Return a fit as JSON; `values` are the proposed values of its entries, by key."""
     found = _progress_json(attempt) | {"reason": one_line(attempt.job.reason)}
     state = STOPPING if attempt.stopping else attempt.job.state
@@ -141,7 +142,7 @@ def _attempt_json(attempt: FitAttempt) -> dict[str, Any]:
     return found
 
 
-def _refit_json(refit: LiveRefit) -> dict[str, Any]:
+def _refit_json(refit: LiveRefit) -> JsonObject:
     """Return a fit of a window as JSON; times as text, since JavaScript's numbers cannot hold them."""
     found = _progress_json(refit.attempt) | {name: getattr(refit, name) for name in ("number", "state", "name")}
     found |= {"text": one_line(refit.text), "start": str(refit.start), "end": str(refit.end)}
@@ -149,7 +150,7 @@ def _refit_json(refit: LiveRefit) -> dict[str, Any]:
     return found if fitted is None or refit.state == FITTING else found | _result_json(fitted)
 
 
-def _progress_json(attempt: FitAttempt) -> dict[str, Any]:
+def _progress_json(attempt: FitAttempt) -> JsonObject:
     found = {name: getattr(attempt, name) for name in ("revision", "events", "seconds", "folds")}
     progress, elapsed = attempt.progress, attempt.job.elapsed
     found |= {"elapsed": elapsed, "expected": None, "left": None, "gain": 0.0, "best": ""}
@@ -162,7 +163,7 @@ def _progress_json(attempt: FitAttempt) -> dict[str, Any]:
     return found
 
 
-def _result_json(fitted: Fitted) -> dict[str, Any]:
+def _result_json(fitted: Fitted) -> JsonObject:
     from ..study.fit_json import fit_json  # which imports SciPy's optimisers, 0.5 s
 
     return {"result": fit_json(fitted)}
@@ -176,11 +177,11 @@ class Advising:
         self.job: Job | None = None
         """The last measurement."""
         self._progress: AdviceProgress | None = None
-        self.advice: dict[str, Any] = {}
+        self.advice: JsonObject = {}
         """The last advice as JSON; a cancelled one leaves the one before."""
         self.revision: int | None = None
 
-    def progress(self) -> dict[str, Any]:
+    def progress(self) -> JsonObject:
         """Return the question that is being answered, the share done, and the seconds spent and left, about."""
         job, progress = self.job, self._progress
         if job is None or progress is None:
@@ -210,7 +211,7 @@ class Advising:
         self._progress = None
         self.job = engine.jobs.run("advice", self.measure, failed=lambda reason: None)
 
-    def measure(self, job: Job) -> dict[str, Any]:
+    def measure(self, job: Job) -> JsonObject:
         """Return the advice on a copy of the log, as JSON."""
         from ..study.advice.measured import AdviceProgress, Measured, without_faults
         from ..study.advice.verdict import advice_json, advise

@@ -24,10 +24,11 @@ from starlette.routing import BaseRoute, Route
 from estimators.errors import ConfigError, NisusError, nearest, printable, quoted, shown_name
 
 from ..engine.jobs import start_in_thread
+from ..result import JsonObject
 from .request_threads import in_thread
 
 T = TypeVar("T")
-Runner = Callable[[Callable[[], Any]], Awaitable[Any]]
+Runner = Callable[[Callable[[], object]], Awaitable[object]]
 
 PAGE = Path(__file__).parent / "page"
 """Folder of the page's HTML, CSS and JavaScript."""
@@ -59,11 +60,11 @@ class Operation(NamedTuple):
     `fields` is None if `body` returns the JSON Schema of the body.
     """
 
-    work: Callable[..., Any]
+    work: Callable[..., object]
     fields: type | None
     sends_body: bool
     status: int
-    body: Callable[[], dict[str, Any]] | None = None
+    body: Callable[[], JsonObject] | None = None
     answer: type | None = None
 
 
@@ -76,7 +77,7 @@ class ApiRoute(Route):
 class Json(JSONResponse):
     """An answer in JSON. A file's name may hold what UTF-8 cannot, so everything that is not ASCII is escaped."""
 
-    def render(self, content: Any) -> bytes:
+    def render(self, content: object) -> bytes:
         """Return the bytes of the answer."""
         return json.dumps(content, allow_nan=False, separators=(",", ":")).encode()
 
@@ -91,7 +92,7 @@ def one_line(text: str) -> str:
     return line if len(line) <= MAX_REASON_CHARACTERS else line[: MAX_REASON_CHARACTERS - 1] + "…"
 
 
-def page_file(name: str, settings: Mapping[str, Any], **parts: str) -> Response:
+def page_file(name: str, settings: Mapping[str, object], **parts: str) -> Response:
     """Answer with an HTML file of the page, or at a path, with settings in an attribute of the body and parts by name.
 
     In an attribute, not in a script: the security policy allows no inline scripts. Scripts and styles of a page behind
@@ -108,7 +109,7 @@ def page_file(name: str, settings: Mapping[str, Any], **parts: str) -> Response:
 
 def get(
     path: str,
-    work: Callable[..., Any],
+    work: Callable[..., object],
     *,
     method: str = "GET",
     refused: int = 400,
@@ -136,7 +137,7 @@ def get(
         given = {name: texts[name] for name in names if name in texts}
         subject = request.url.path.rpartition("/")[2].partition(".")[0]
 
-        def call() -> Any:
+        def call() -> object:
             fields = vars(parse(kind, given, subject, text=True))
             return work(request, **fields) if takes_request else work(**fields)
 
@@ -149,11 +150,11 @@ def get(
 
 def post(
     path: str,
-    work: Callable[..., Any],
+    work: Callable[..., object],
     *,
     status: int = 200,
     run: Runner = in_thread,
-    body_schema: Callable[[], dict[str, Any]] | None = None,
+    body_schema: Callable[[], JsonObject] | None = None,
 ) -> Route:
     """Return a route that calls `work` in a thread with the fields of the request's JSON body; see `get`.
 
@@ -179,10 +180,10 @@ def post(
         request.scope[PARSED_BODY] = body, len(text)
         subject = request.url.path.removeprefix("/api/")
 
-        def call() -> Any:
+        def call() -> object:
             if takes_body:
                 return work(body)
-            given: Any = parse(kind, body, subject)
+            given = parse(kind, body, subject)
             return work(given) if whole else work(**vars(given))
 
         return await _answered(call, run, status, 400)
@@ -192,7 +193,7 @@ def post(
     return route
 
 
-async def _answered(call: Callable[[], Any], run: Runner, status: int, refused: int) -> Response:
+async def _answered(call: Callable[[], object], run: Runner, status: int, refused: int) -> Response:
     try:
         found = await run(call)
     except NisusError as error:
@@ -254,7 +255,7 @@ class OneAtATime:
 # Fields of a request as a dataclass
 
 
-def parse(kind: type[T], given: Any, subject: str, *, text: bool = False) -> T:
+def parse(kind: type[T], given: object, subject: str, *, text: bool = False) -> T:
     """Return a dataclass (`kind`) of the fields of a JSON object, strictly: no text in place of a number.
 
     Infinity is written "inf" in place of a number. If all values are `text` of an address, they are converted. An error
@@ -285,7 +286,7 @@ def parse(kind: type[T], given: Any, subject: str, *, text: bool = False) -> T:
         raise ConfigError(_line(error, given, subject)) from None
 
 
-def _number(where: str, value: Any, hint: Any) -> Any:
+def _number(where: str, value: object, hint: object) -> object:
     """Return a value as pydantic takes it: infinity as a number, NaN as none; refuse what JSON's readers differ in."""
     if isinstance(value, dict):
         return {key: _number(f"{where}.{shown_name(key)}", item, hint) for key, item in value.items()}
@@ -298,7 +299,7 @@ def _number(where: str, value: Any, hint: Any) -> Any:
     return "NaN" if isinstance(value, float) and math.isnan(value) else value
 
 
-def _line(error: ValidationError, given: Any, subject: str) -> str:
+def _line(error: ValidationError, given: object, subject: str) -> str:
     problems = error.errors(include_url=False)
     path, value = [], given
     for part in problems[0]["loc"]:  # the rest of a location names members of a union
@@ -313,7 +314,7 @@ def _line(error: ValidationError, given: Any, subject: str) -> str:
     return f"{subject}: {'.'.join(path)} is {shown(value)}; it must be {' or '.join(dict.fromkeys(rules))}"
 
 
-def shown(value: Any) -> str:
+def shown(value: object) -> str:
     """Return a value of a request as an error shows it: as JSON, shortened."""
     return quoted(value) if isinstance(value, str) else shown_name(json.dumps(value))
 
@@ -321,7 +322,7 @@ def shown(value: Any) -> str:
 _adapter = cache(TypeAdapter)
 
 
-def _parameters(work: Callable[..., Any]) -> type:
+def _parameters(work: Callable[..., object]) -> type:
     """Return a dataclass of the parameters of a function, without `request` and `body`."""
     hints = typing.get_type_hints(work, include_extras=True)
     fields: list[Any] = []
@@ -337,10 +338,10 @@ def _parameters(work: Callable[..., Any]) -> type:
 MODELS_AT = "#/components/schemas/"
 
 
-def openapi(routes: Iterable[BaseRoute]) -> dict[str, Any]:
+def openapi(routes: Iterable[BaseRoute]) -> JsonObject:
     """Return the OpenAPI document of routes, from the docstrings and parameters of their functions."""
-    models: dict[str, Any] = {}
-    paths: dict[str, Any] = {}
+    models: JsonObject = {}
+    paths: JsonObject = {}
     for route in routes:
         if not isinstance(route, Route) or not route.path.startswith(("/api/", "/metrics", "/healthz", "/readyz")):
             continue
@@ -356,13 +357,13 @@ def openapi(routes: Iterable[BaseRoute]) -> dict[str, Any]:
     }
 
 
-def _described(route: Route, method: str, path: str, models: dict[str, Any]) -> dict[str, Any]:
+def _described(route: Route, method: str, path: str, models: JsonObject) -> JsonObject:
     """Return one operation; the models that it refers to are added to `models`."""
     operation = getattr(route, "operation", None)
     work = route.endpoint if operation is None else operation.work
     lines = (inspect.getdoc(work) or "").split("\n\n")[0].split()
-    found: dict[str, Any] = {"operationId": f"{method.lower()} {path}", "summary": " ".join(lines)}
-    answer: dict[str, Any] = {"description": "the answer"}
+    found: JsonObject = {"operationId": f"{method.lower()} {path}", "summary": " ".join(lines)}
+    answer: JsonObject = {"description": "the answer"}
     status = 200
     if operation is not None:
         status = operation.status
@@ -392,7 +393,7 @@ def _described(route: Route, method: str, path: str, models: dict[str, Any]) -> 
 ERROR = {"application/json": {"schema": {"type": "object", "properties": {"error": {"type": "string"}}}}}
 
 
-def _schema(kind: Any, models: dict[str, Any]) -> dict[str, Any]:
+def _schema(kind: Any, models: JsonObject) -> JsonObject:
     """Return the JSON Schema of a type, with references to `models`."""
     schema = TypeAdapter(kind).json_schema(ref_template=f"{MODELS_AT}{{model}}")
     models |= schema.pop("$defs", {})

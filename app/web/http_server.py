@@ -19,7 +19,7 @@ import uuid
 from collections import Counter
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
-from typing import Any, Protocol
+from typing import Protocol
 
 import h11
 import uvicorn
@@ -147,7 +147,7 @@ class Auditor(Protocol):
     def revision(self) -> int | None:
         """Return the revision that is shown; None if there are several twins."""
 
-    def add(self, user: User, path: str, body: Mapping[str, Any], revision: int | None = None) -> None:
+    def add(self, user: User, path: str, body: Mapping[str, object], revision: int | None = None) -> None:
         """Note a request that was carried out; `revision` was shown when it arrived, by default that of now."""
 
 
@@ -165,7 +165,7 @@ class ShownApplication:
     async def stream(self, scope: Scope, receive: Receive, send: Send) -> None:
         """Serve a WebSocket until the application is replaced."""
 
-        async def receive_until_replaced() -> Any:
+        async def receive_until_replaced() -> Message:
             message, end = asyncio.ensure_future(receive()), asyncio.ensure_future(self.replaced.wait())
             try:
                 await asyncio.wait({message, end}, return_when=asyncio.FIRST_COMPLETED)

@@ -8,7 +8,7 @@ import struct
 import time
 from collections.abc import Callable, Mapping, Sequence
 from types import MappingProxyType
-from typing import Any, Protocol
+from typing import Protocol
 
 import numpy as np
 from starlette.requests import Request
@@ -20,6 +20,7 @@ from sources.messages import ACCEPTED, CLOSED, DUPLICATE, NO_ROOM, REFUSED, Answ
 
 from ..engine.outcomes import Outcomes
 from ..engine.running_fold import StateWriter
+from ..result import JsonObject
 from ..twin.twin import Twin
 from .http import Json, TooLarge, bounded_body, get, refusal
 from .request_threads import in_thread
@@ -41,7 +42,7 @@ class Recipient(Protocol):
     """A running twin or fleet, whose source may take messages."""
 
     @property
-    def source(self) -> Any:
+    def source(self) -> object:
         """Its source."""
 
     @property
@@ -60,7 +61,7 @@ class Recipient(Protocol):
 def routes(engine: Recipient) -> list[BaseRoute]:
     """Return the routes of a running twin or fleet."""
 
-    def names() -> dict[str, Any]:
+    def names() -> JsonObject:
         """Return names and units of the values that the twin reads."""
         source = messages_of(engine)
         return {"values": [{"name": name, "unit": source.units.get(name)} for name in source.names]}
@@ -104,7 +105,7 @@ def messages_of(engine: Recipient) -> Messages:
     return source
 
 
-async def send_to(engine: Recipient, messages: Sequence[Any]) -> dict[str, Any]:
+async def send_to(engine: Recipient, messages: Sequence[object]) -> JsonObject:
     """Send messages; return what became of each, the counts, and whether the store has them."""
     source = messages_of(engine)
     answers = await in_thread(lambda: source.send(messages))
@@ -116,7 +117,7 @@ async def send_to(engine: Recipient, messages: Sequence[Any]) -> dict[str, Any]:
     return summary(answers, became) | {"stored": kept}
 
 
-def summary(answers: Sequence[Answer], became: Mapping[int, str] = MappingProxyType({})) -> dict[str, Any]:
+def summary(answers: Sequence[Answer], became: Mapping[int, str] = MappingProxyType({})) -> JsonObject:
     """Return the answers and their counts, with what `became` of accepted ones by arrival, as far as it is known."""
     counts = {status: sum(item.status == status for item in answers) for status in (ACCEPTED, DUPLICATE, REFUSED)}
     items = [
@@ -151,7 +152,7 @@ async def stored(engine: Recipient, mark: int) -> bool:
     return False
 
 
-def _of_json(body: bytes, fields: Sequence[str]) -> Sequence[Any]:
+def _of_json(body: bytes, fields: Sequence[str]) -> Sequence[object]:
     try:
         found = json.loads(body)
     except (ValueError, RecursionError):
@@ -159,9 +160,9 @@ def _of_json(body: bytes, fields: Sequence[str]) -> Sequence[Any]:
     return found if isinstance(found, list) else [found]
 
 
-def _of_lines(body: bytes, fields: Sequence[str]) -> Sequence[Any]:
+def _of_lines(body: bytes, fields: Sequence[str]) -> Sequence[object]:
     """Return the messages of NDJSON; a line that is no JSON is refused alone."""
-    found: list[Any] = []
+    found: list[object] = []
     for line in body.splitlines():
         if line.strip():
             try:
@@ -176,7 +177,7 @@ def _check_count(messages: int) -> None:
         raise TooLarge(f"a body may have {MAX_MESSAGES:,} messages; send fewer at once")
 
 
-def _of_arrow(body: bytes, fields: Sequence[str]) -> Sequence[Any]:
+def _of_arrow(body: bytes, fields: Sequence[str]) -> Sequence[object]:
     """Return the messages of a stream of Arrow batches: the fields of a message, and a column for each value."""
     import pyarrow as pa
 
@@ -228,13 +229,13 @@ def _is_compressed(message: bytes) -> bool:
     return bool(kind and header) and message[kind] == RECORD_BATCH and place(table_at(header), 3) != 0
 
 
-def _message(row: Mapping[str, Any], fields: Sequence[str]) -> dict[str, Any]:
+def _message(row: Mapping[str, object], fields: Sequence[str]) -> JsonObject:
     """Return a message of a row; a null is no value, as rows of one batch may come from several sensors."""
     head = {name: row[name] for name in fields if name != "values" and row.get(name) is not None}
     return head | {"values": {name: value for name, value in row.items() if name not in fields and value is not None}}
 
 
-READERS: dict[str, Callable[[bytes, Sequence[str]], Sequence[Any]]] = {
+READERS: dict[str, Callable[[bytes, Sequence[str]], Sequence[object]]] = {
     "application/json": _of_json,
     "application/x-ndjson": _of_lines,
     "application/vnd.apache.arrow.stream": _of_arrow,

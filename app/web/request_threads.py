@@ -6,7 +6,7 @@ import asyncio
 from collections.abc import Callable
 from contextlib import suppress
 from functools import partial
-from typing import Any, TypeVar
+from typing import TypeVar
 
 from anyio import CapacityLimiter, to_thread
 
@@ -20,7 +20,9 @@ ONE_AT_A_TIME = CapacityLimiter(1)
 """For the feeds of all Rerun viewers: Rerun's allocator keeps free memory for each thread that has used it at once."""
 
 
-async def in_thread(work: Callable[..., T], *arguments: Any, limiter: CapacityLimiter | None = None, **named: Any) -> T:
+async def in_thread(
+    work: Callable[..., T], *arguments: object, limiter: CapacityLimiter | None = None, **named: object
+) -> T:
     """Return the result of work in one of the threads; it is awaited also when the task is cancelled meanwhile."""
     outcome = asyncio.ensure_future(to_thread.run_sync(partial(work, *arguments, **named), limiter=limiter))
     try:

@@ -20,6 +20,8 @@ from ..record.writer import ALL_STRETCHES, Recorder
 from ..terminal import complain, print_line
 
 if TYPE_CHECKING:
+    from rerun import RecordingStream
+
     from estimators.snapshots import Base
     from sources.source import Source
 
@@ -28,7 +30,6 @@ if TYPE_CHECKING:
     from ..explore.rows import RerunRows
     from ..twin.twin import Twin
     from .http_server import HttpServer
-
 
 PRINT_PERIOD_S = 0.5
 """Seconds between two looks for notices to print."""
@@ -166,7 +167,7 @@ class RunningTwin:
                 self.discard()
                 raise
 
-    def _draw_into(self, stream: Any) -> RerunRows:
+    def _draw_into(self, stream: RecordingStream) -> RerunRows:
         """Return a function that logs the charts of a pull into a Rerun stream."""
         from ..explore.rows import RerunRows
 

@@ -6,7 +6,6 @@ import re
 from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
-from typing import Any
 
 from starlette.convertors import IntegerConvertor, register_url_convertor
 from starlette.requests import Request
@@ -32,6 +31,7 @@ from ..render.html import to_html
 from ..render.report import Reported, report
 from ..render.runs_json import changes_json, noise_json, runs_json, swept_json, what_changed
 from ..render.track_file import KINDS, encoded, rows_of_run, tables
+from ..result import JsonObject
 from ..study.commission import baseline_of, lines, storable, store_baseline
 from ..twin.changes import difference
 from ..twin.tuning_yaml import tuning_yaml
@@ -78,7 +78,7 @@ class RunsApi:
             get("/api/report.html", self._report, refused=409, run=copying),
         ]
 
-    def _runs(self) -> Any:
+    def _runs(self) -> list[JsonObject]:
         """Return every run with its changes and scores."""
         return runs_json(self.scores, self._engine)
 
@@ -90,27 +90,27 @@ class RunsApi:
         text = f"{heading}\n{notes}{tuning_yaml(twin.config, run.estimator, run.tuning)}"
         return PlainTextResponse(text, headers=self._attachment(number, ".yaml"))
 
-    def _difference(self, number: int, other: int) -> Any:
+    def _difference(self, number: int, other: int) -> list[JsonObject]:
         """Return the entries in which two runs differ."""
         one, two = self._engine.revisions.find(number), self._engine.revisions.find(other)
         return changes_json(difference(one.estimator, one.tuning, two.estimator, two.tuning))
 
-    def _around(self, key: str = "") -> Any:
+    def _around(self, key: str = "") -> JsonObject:
         """Return the likelihood around the value of an entry."""
         return swept_json(self._sweeps.around(key))
 
-    def _noise(self) -> Any:
+    def _noise(self) -> JsonObject:
         """Return R and Q as estimated from the innovations."""
         return noise_json(noise(self._engine, self._sweeps))
 
     # Tuning versions
 
-    def _tunings(self) -> Any:
+    def _tunings(self) -> JsonObject:
         """List the tuning versions."""
         twin = self._engine.twin
         return {"running": self._engine.status().tuning.name, "versions": listing(twin), "guard": verdicts(twin.path)}
 
-    def _keep(self, run: int, name: str, note: str) -> Any:
+    def _keep(self, run: int, name: str, note: str) -> JsonObject:
         """Keep a run as a version, with its scores."""
         kept, twin = self._engine.revisions.find(run), self._engine.twin
         known = next((known for other, known in self.scores.all() if other.number == run), None)
@@ -124,18 +124,18 @@ class RunsApi:
         keep(twin, name, version_text(twin, settings))
         return {"name": name}
 
-    def _load(self, name: str) -> Any:
+    def _load(self, name: str) -> JsonObject:
         """Load a version; the history is folded again with it."""
         load_into(self._engine, _listed(name))
         return {"name": name}
 
-    def _against(self, name: str) -> Any:
+    def _against(self, name: str) -> list[JsonObject]:
         """List the entries in which a version differs from the running tuning."""
         tuning, estimator = self._engine.folded_with()
         twin = with_version(self._engine.twin, _listed(name))
         return changes_json(difference(twin.estimator, twin.tuning, estimator, tuning))
 
-    def _baseline(self, force: bool = False) -> Any:
+    def _baseline(self, force: bool = False) -> JsonObject:
         """Write the baseline of the running tuning into the twin's file, which is then read again."""
         return {"file": commission_running(self._engine, force=force).name}
 

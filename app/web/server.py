@@ -10,7 +10,7 @@ import uuid
 from collections.abc import AsyncIterator
 from concurrent.futures import Future
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import numpy as np
 from starlette.applications import Starlette
@@ -35,7 +35,7 @@ from ..engine.outputs.alarm_guide import alarms_text, as_html
 from ..engine.outputs.alerts import alert_schema
 from ..engine.outputs.publisher import ALIVE_PERIOD_S
 from ..engine.outputs.state_message import StateMessage, state_message, state_schema
-from ..result import plain
+from ..result import JsonObject, plain
 from ..study.why import why_json
 from ..terminal import messages_file
 from . import readings
@@ -61,7 +61,7 @@ COMPILE_POLL_PERIOD_S = 0.5
 CHART_FILES = sorted(path.name for path in (PAGE / "charts").glob("*.js"))
 """Kinds of charts, one per file."""
 
-NOT_PUBLISHED: dict[str, Any] = {
+NOT_PUBLISHED: JsonObject = {
     "outputs": [], "receivers": [], "alerts": [], "muted_s": 0.0, "mute_reason": "",
 }  # fmt: skip
 """Outputs of a recording, which is published nowhere."""
@@ -227,7 +227,7 @@ class PageServer:
             return PlainTextResponse(f"Nisus: {error}\n", 404)
         return page_file("alarms.html", {}, text=text)
 
-    def _status(self) -> dict[str, Any]:
+    def _status(self) -> JsonObject:
         """Return the state of the twin."""
         return status_json(self._engine) | {
             "recordings": sorted(self._recordings()),
@@ -238,15 +238,15 @@ class PageServer:
             "refit": self._fit.brief(),
         }
 
-    def _model(self) -> dict[str, Any]:
+    def _model(self) -> JsonObject:
         """Return names, units and configured values of the twin, and the estimators."""
         return model_json(self._engine)
 
-    def _episodes(self) -> list[dict[str, Any]]:
+    def _episodes(self) -> list[JsonObject]:
         """Return all episodes by their start."""
         return episodes_json(self._engine)
 
-    def _why(self, since: float, until: float) -> dict[str, Any]:
+    def _why(self, since: float, until: float) -> JsonObject:
         """Attribute the change of the estimate between two times of the charts, s."""
         model, origin = self._engine.model, self.series.origin() or 0
         begin, end = (origin + round(max(-1e9, min(at, 1e9)) * 1e9) for at in (since, until))
@@ -256,36 +256,36 @@ class PageServer:
         fold = window.fold(policy=self._engine.policy, expected=self._engine.twin.expected)
         return dict(plain(why_json(model, attribution(fold, begin, end), origin)))
 
-    def _annotations(self) -> list[dict[str, Any]]:
+    def _annotations(self) -> list[JsonObject]:
         """Return all notes of users by time."""
         return annotations_json(self._engine)
 
-    def _audit(self) -> list[dict[str, Any]]:
+    def _audit(self) -> list[JsonObject]:
         """Return the last commands of users by time, in seconds since 1970."""
         names = ("number", "at", "user", "role", "address", "path", "body", "revision")
         return [{name: getattr(entry, name) for name in names} for entry in self._engine.audit.entries()]
 
-    def _faults(self) -> dict[str, Any]:
+    def _faults(self) -> JsonObject:
         """Return the faults that can be injected into the source."""
         return catalogue_json(self._engine.source, self._engine.model)
 
-    def _command(self, body: Any) -> dict[str, str]:
+    def _command(self, body: object) -> dict[str, str]:
         """Carry out `{"command": NAME, field: value, ...}` (app/engine/commands.py)."""
         command = command_from_json(body, self._engine)
         self._engine.submit(command)
         return {"submitted": type(command).__name__}
 
-    def _forecast(self, body: Any) -> Any:
+    def _forecast(self, body: object) -> JsonObject:
         """Forecast from the present estimate."""
         return self._forecasts.compute(question_from_json(body, self._engine.model))
 
-    def _scene(self) -> Any:
+    def _scene(self) -> Response | list[JsonObject]:
         """Return the options of the scene."""
         if self._choices is None:
             return PlainTextResponse("Nisus: there is no scene.\n", 404)
         return self._choices.json()
 
-    def _choose(self, key: str, value: str) -> Any:
+    def _choose(self, key: str, value: str) -> Response | list[JsonObject]:
         """Choose an option of the scene."""
         if self._choices is not None:
             self._choices.choose(key, value)
@@ -313,7 +313,7 @@ class PageServer:
         paths = [*(recorder.finished if recorder is not None else ()), *([self._review] if self._review else [])]
         return {path.name: path for path in paths}
 
-    def _list_recordings(self) -> list[dict[str, Any]]:
+    def _list_recordings(self) -> list[JsonObject]:
         """Return names and sizes of the recordings of this process."""
         found = {name: path for name, path in self._recordings().items() if path.is_file()}
         return [{"name": name, "bytes": path.stat().st_size} for name, path in sorted(found.items())]
@@ -338,11 +338,11 @@ class PageServer:
         """Answer with the present state (see docs/http-api.md)."""
         return _message(state_message(self._engine, covariance=covariance))
 
-    def _openapi(self) -> dict[str, Any]:
+    def _openapi(self) -> JsonObject:
         """Return the OpenAPI document of all paths."""
         return openapi([*self.http_server.routes, *self.application.routes])
 
-    def _alerts(self) -> dict[str, Any]:
+    def _alerts(self) -> JsonObject:
         """Return open alerts, and the state of outputs and receivers."""
         published = self._engine.published
         return NOT_PUBLISHED if published is None else published.json()
@@ -378,7 +378,7 @@ class PageServer:
 
         return RerunFeed(self._engine, layout=layout, palette=palette)
 
-    def _rerun_status(self) -> dict[str, Any]:
+    def _rerun_status(self) -> JsonObject:
         origin = self.series.origin()
         return {
             "status": status_json(self._engine),

@@ -16,22 +16,19 @@ from collections.abc import Callable
 from contextlib import suppress
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import TYPE_CHECKING
 
 from estimators.errors import SourceError
 
 from ..engine.commands import Record
+from ..engine.engine import Engine
 from ..engine.jobs import run_all
+from ..engine.notices import Annotation
 from ..record.rrd_file import NEVER, Split
+from ..record.writer import Recorder
 from ..terminal import complain, until_asked_to_end
 from .access import Grant
 from .http_server import HttpServer
 from .running import OpenedTwin, RunningTwin
-
-if TYPE_CHECKING:
-    from ..engine.engine import Engine
-    from ..engine.notices import Annotation
-    from ..record.writer import Recorder
 
 DISCONNECT_TIMEOUT_S = 3.0
 """Longest wait for browsers that keep connections to a stopped twin."""

@@ -11,7 +11,7 @@ import json
 import time
 from collections.abc import Awaitable, Callable
 from dataclasses import dataclass, field
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import numpy as np
 from starlette.websockets import WebSocket, WebSocketDisconnect
@@ -21,6 +21,7 @@ from estimators.errors import ConfigError, nearest
 from ..charts.chart_stream import ChartQuery, ChartStream, Seconds
 from ..charts.series import Series
 from ..engine.engine import Engine
+from ..result import JsonObject
 from .http import MAX_BODY_BYTES, one_line, parse
 from .request_threads import in_rerun_thread, in_thread
 from .twin_json import annotations_json, episodes_json, moment_json
@@ -84,16 +85,16 @@ class PageStream:
     """Serves one page: JSON in text messages, frames of its chart streams in binary ones."""
 
     def __init__(
-        self, browser: WebSocket, engine: Engine, series: Series, status: Callable[[], dict[str, Any]], boot: str,
+        self, browser: WebSocket, engine: Engine, series: Series, status: Callable[[], JsonObject], boot: str,
         choices: Choices | None = None,
     ) -> None:  # fmt: skip
         self._browser, self._engine, self._series, self._status = browser, engine, series, status
         self._streams: dict[str, ChartStream] = {}
         self._drawn, self._asked, self._pointed = asyncio.Event(), asyncio.Event(), asyncio.Event()
         self._drawn.set()
-        self._sent: dict[str, Any] = {}
+        self._sent: JsonObject = {}
         self._boot = boot
-        self._episodes: list[dict[str, Any]] | None = None
+        self._episodes: list[JsonObject] | None = None
         self._notes: tuple[Annotation, ...] | None = None
         self._notice = 0
         self._pair: tuple[int, ...] | None = None
@@ -101,7 +102,7 @@ class PageStream:
         self._choices = choices
         self._at: int | None = None
         """Time that the page shows, ns; None is the newest row."""
-        self._moment: tuple[Any, dict[str, Any]] | None = None
+        self._moment: tuple[object, JsonObject] | None = None
         """Trust at that time, after what it was computed from."""
 
     async def run(self) -> None:
@@ -139,7 +140,7 @@ class PageStream:
             except (ConfigError, ValueError, RecursionError) as error:
                 await self._browser.send_text(json.dumps({"error": one_line(str(error))}))
 
-    async def _take(self, message: Any) -> None:
+    async def _take(self, message: JsonObject) -> None:
         wanted = parse(PageMessage, message, "page")
         if wanted.drawn:
             self._drawn.set()
@@ -208,7 +209,7 @@ class PageStream:
                 async with asyncio.timeout(max(0.001, STATUS_PERIOD_S - (time.monotonic() - begun))):
                     await self._pointed.wait()
 
-    def _trust_then(self, at: int | None, episodes: list[dict[str, Any]]) -> dict[str, Any] | None:
+    def _trust_then(self, at: int | None, episodes: list[JsonObject]) -> JsonObject | None:
         """Return health, sensors, NIS and cause at the time that the page shows; None for the newest row."""
         if at is None:
             return None
@@ -248,11 +249,11 @@ class PageStream:
             self._estimated = now
             await self._send({"belief": await in_thread(belief_json, self._engine, list(self._pair), at)})
 
-    async def _send(self, message: dict[str, Any]) -> None:
+    async def _send(self, message: JsonObject) -> None:
         await self._browser.send_text(json.dumps(message, allow_nan=False, separators=(",", ":")))
 
 
-def changes(before: dict[str, Any], now: dict[str, Any]) -> dict[str, Any]:
+def changes(before: JsonObject, now: JsonObject) -> JsonObject:
     """Return the message with the changed fields of a status; of a field with many entries only the changed ones.
 
     `status` has fields, `entries` entries by field. A field that has lost an entry is sent whole.
@@ -272,7 +273,7 @@ def changes(before: dict[str, Any], now: dict[str, Any]) -> dict[str, Any]:
     return ({"status": news} if news or entries else {}) | ({"entries": entries} if entries else {})
 
 
-def belief_json(engine: Engine, pair: list[int], at: int | None = None) -> dict[str, Any] | None:
+def belief_json(engine: Engine, pair: list[int], at: int | None = None) -> JsonObject | None:
     """Return mean (2), covariance [a, b, c] of [[a, b], [b, c]] and particles (k, 2); None while not finite.
 
     `at` is a time, ns; None is the present.
@@ -290,7 +291,7 @@ def belief_json(engine: Engine, pair: list[int], at: int | None = None) -> dict[
     }
 
 
-async def feed_rerun(browser: WebSocket, feed: RerunFeed, status: Callable[[], dict[str, Any]]) -> None:
+async def feed_rerun(browser: WebSocket, feed: RerunFeed, status: Callable[[], JsonObject]) -> None:
     """Feed one Rerun viewer, and send its window the status."""
     drawn = asyncio.Event()
     drawn.set()

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from typing import Any
-
 from estimators.diagnostics.detectors import detector_of
 from estimators.diagnostics.episodes import episode_json
 from estimators.diagnostics.references import state_grades
@@ -16,7 +14,7 @@ from ..engine import faults
 from ..engine.copies import Status
 from ..engine.engine import Engine
 from ..render.report_charts import charted_model
-from ..result import plain
+from ..result import JsonObject, plain
 from ..study.commission import storable
 from ..study.fit_json import nis_json
 from ..twin.changes import began_as, turned
@@ -36,13 +34,13 @@ TRUST_FIELDS = (
 """Fields of a status that belong to its time."""
 
 
-def moment_json(engine: Engine, t: int) -> dict[str, Any]:
+def moment_json(engine: Engine, t: int) -> JsonObject:
     """Return the `TRUST_FIELDS` of the status at a time, ns."""
     found = status_json(engine, engine.status_at(t))
     return {name: found[name] for name in TRUST_FIELDS}
 
 
-def status_json(engine: Engine, status: Status | None = None) -> dict[str, Any]:
+def status_json(engine: Engine, status: Status | None = None) -> JsonObject:
     """Return the state of a running twin, or the given one; infinity is "inf", NaN null."""
     status, twin, revisions = status or engine.status(), engine.twin, engine.revisions
     edits = revisions.edits
@@ -104,7 +102,7 @@ def status_json(engine: Engine, status: Status | None = None) -> dict[str, Any]:
     return plain(found, infinity_text=True) | of_sensors  # type: ignore[no-any-return]
 
 
-def episodes_json(engine: Engine) -> list[dict[str, Any]]:
+def episodes_json(engine: Engine) -> list[JsonObject]:
     """Return all episodes by their start: times in seconds of the log, `help` in docs/alarms.md."""
     return [
         episode_json(episode) | {"help": f"docs/alarms.md#{row.anchor}", "severity": row.severity}
@@ -113,16 +111,16 @@ def episodes_json(engine: Engine) -> list[dict[str, Any]]:
     ]
 
 
-def annotations_json(engine: Engine) -> list[dict[str, Any]]:
+def annotations_json(engine: Engine) -> list[JsonObject]:
     """Return all notes of users by time, in seconds of the log."""
     return [{"number": note.number, "at": note.t * 1e-9, "text": note.text} for note in engine.annotations.notes]
 
 
-def model_json(engine: Engine) -> dict[str, Any]:
+def model_json(engine: Engine) -> JsonObject:
     """Return names, units and configured values of a twin, and every estimator with its options or why it is unfit."""
     model, twin = engine.model, engine.twin
 
-    def options(name: str) -> list[dict[str, Any]]:
+    def options(name: str) -> list[JsonObject]:
         configured = dict(twin.options_of(name))
         return [
             option._asdict() | {"whole": option.whole, "configured": configured.get(option.name, option.default)}

@@ -25,7 +25,7 @@ class StoredRules(Protocol):
     def message(self) -> type[AlertMessage]:
         """Type of their messages."""
 
-    def state(self) -> list[Any]:
+    def state(self) -> Sequence[object]:
         """Return the open alerts for JSON."""
 
     def restore(self, state: Sequence[Any], ago: float) -> None:

@@ -9,7 +9,7 @@ import hashlib
 import math
 import time
 from collections.abc import Callable, Iterator, Sequence
-from typing import TYPE_CHECKING, Any, Literal, NamedTuple
+from typing import Any, Literal, NamedTuple
 
 from pydantic import BaseModel, ConfigDict, Field
 
@@ -18,11 +18,10 @@ from estimators.diagnostics.detectors import anchor
 from estimators.errors import printable
 from estimators.track import HEALTH_NAMES, WAITING
 
+from ...result import JsonObject
+from ..engine import Engine
 from .alarm_guide import advice
 from .state_message import StateMessage, iso_now
-
-if TYPE_CHECKING:
-    from ..engine import Engine
 
 SCHEMA: Literal["nisus.alert/1"] = "nisus.alert/1"
 
@@ -61,7 +60,7 @@ class AlertMessage(BaseModel):
     response: str = Field(default="", description="response by the guide")
 
 
-def alert_schema() -> dict[str, Any]:
+def alert_schema() -> JsonObject:
     """Return the JSON Schema of an alert."""
     return AlertMessage.model_json_schema(mode="serialization")
 
@@ -195,7 +194,7 @@ class AlertRules:
                     due.append((rule, self._message(entry, FIRING if first else REPEATED, message)))
         return due
 
-    def state(self) -> list[Any]:
+    def state(self) -> list[JsonObject]:
         """Return the open alerts, for JSON."""
         now = self._clock()
         return [
@@ -204,7 +203,7 @@ class AlertRules:
             for key, entry in self._open.items() if entry.sent is not None
         ]  # fmt: skip
 
-    def restore(self, state: Sequence[Any], ago: float) -> None:
+    def restore(self, state: Sequence[JsonObject], ago: float) -> None:
         """Continue with the open alerts of `state`, which was returned some seconds `ago`.
 
         That of a rule which is no longer there is resolved.

@@ -9,27 +9,27 @@ import threading
 import time
 from collections.abc import Callable
 from functools import partial
-from typing import TYPE_CHECKING, Any, NamedTuple, Protocol, runtime_checkable
+from typing import NamedTuple, Protocol, TypeVar, runtime_checkable
 
 import numpy as np
 
 from config.extensions import maker, schemas
 from config.output_schema import AlertSection
+from config.schema import TwinSection
 from estimators.errors import ConfigError, NisusError, printable
 
+from ...result import JsonObject
 from ...twin.secrets import secrets_of
 from ..copies import OutputLink
+from ..engine import Engine
 from ..jobs import Jobs, LoopThread
+from ..store import Store
 from .alert_store import AlertStore
 from .alerts import AlertRules
 from .receivers import Deliveries
 from .state_message import StateMessage, state_message
 
-if TYPE_CHECKING:
-    from config.schema import TwinSection
-
-    from ..engine import Engine
-    from ..store import Store
+T = TypeVar("T")
 
 ALIVE_PERIOD_S = 1.0
 """Between two messages of a state that does not change: its age does."""
@@ -109,7 +109,7 @@ class Publisher:
         self._end()
         self._store.close()
 
-    def json(self) -> dict[str, Any]:
+    def json(self) -> JsonObject:
         """Return the state of outputs, receivers and alerts."""
         parts, mute = self._parts, self._engine.mute
         links = [self._guarded(item, item.link) or FAILED for item in parts.outputs]
@@ -206,7 +206,7 @@ class Publisher:
         self._parts = parts
         self._begin()
 
-    def _guarded(self, output: Output, work: Callable[[], Any]) -> Any:
+    def _guarded(self, output: Output, work: Callable[[], T]) -> T | None:
         """Return the result of a method of an output; None if it fails, which is reported."""
         try:
             return work()

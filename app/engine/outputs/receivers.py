@@ -16,14 +16,14 @@ from collections import deque
 from collections.abc import Mapping, Sequence
 from contextlib import suppress
 from functools import partial
-from http.client import HTTPConnection, HTTPSConnection
+from http.client import HTTPConnection, HTTPResponse, HTTPSConnection
 from pathlib import Path
 from typing import Any, Protocol
 from urllib.error import HTTPError, URLError
 from urllib.request import HTTPHandler, HTTPRedirectHandler, HTTPSHandler, Request, build_opener
 
 from config.extensions import maker
-from config.output_schema import WebhookSection
+from config.output_schema import ReceiverSection, WebhookSection
 from estimators.errors import printable
 from sources.worker_process import gist
 
@@ -56,7 +56,7 @@ class Receiver(Protocol):
 class KeptRequest(HTTPRedirectHandler):
     """Follows no redirect: a signed alert goes to the address that was configured, or nowhere."""
 
-    def redirect_request(self, *args: Any, **more: Any) -> None:
+    def redirect_request(self, *args: object, **more: object) -> None:
         """Return no request."""
 
 
@@ -94,11 +94,11 @@ class RequestDeadline(HTTPSHandler, HTTPHandler):
         super().__init__()
         self._deadline = deadline
 
-    def http_open(self, request: Request) -> Any:
+    def http_open(self, request: Request) -> HTTPResponse:
         """See `HTTPHandler`."""
         return self.do_open(partial(self._connection, PlainConnection), request)  # type: ignore[arg-type]
 
-    def https_open(self, request: Request) -> Any:
+    def https_open(self, request: Request) -> HTTPResponse:
         """See `HTTPSHandler`."""
         return self.do_open(partial(self._connection, SecureConnection), request)  # type: ignore[arg-type]
 
@@ -228,7 +228,12 @@ class Deliveries:
     """Queues of all receivers, and their messages that a twin or fleet runs."""
 
     def __init__(
-        self, sections: Mapping[str, Any], folder: Path, outputs: Mapping[str, Any], notices: Notices, secrets: Secrets
+        self,
+        sections: Mapping[str, ReceiverSection],
+        folder: Path,
+        outputs: Mapping[str, object],
+        notices: Notices,
+        secrets: Secrets,
     ) -> None:
         """Make the receivers.
 
@@ -287,7 +292,7 @@ class Deliveries:
 
 
 def make_receivers(
-    sections: Mapping[str, Any], folder: Path, outputs: Mapping[str, Any], secrets: Secrets
+    sections: Mapping[str, ReceiverSection], folder: Path, outputs: Mapping[str, object], secrets: Secrets
 ) -> dict[str, Receiver]:
     """Return the receivers by name."""
     found: dict[str, Receiver] = {}

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import math
 import time
-from typing import Annotated, Any, Literal
+from typing import Annotated, Literal
 
 import numpy as np
 from pydantic import BaseModel, ConfigDict, Field, model_validator
@@ -17,8 +17,10 @@ from estimators.diagnostics.detectors import CALENDAR_FROM_S, is_outside
 from estimators.diagnostics.references import state_grades
 from estimators.diagnostics.sensitivity import Bound
 from estimators.model.parts import State
+from estimators.model.state_space import Input
 from estimators.track import DEGRADED, DIVERGED, GATED, HEALTH_NAMES, MISSING, SUSPECT, USABLE, USED
 
+from ...result import JsonObject
 from ..engine import Engine
 
 SCHEMA: Literal["nisus.state/1"] = "nisus.state/1"
@@ -188,12 +190,12 @@ def calendar_time(t: int | None) -> str | None:
     return iso(t) if t is not None and t * 1e-9 >= CALENDAR_FROM_S else None
 
 
-def state_schema() -> dict[str, Any]:
+def state_schema() -> JsonObject:
     """Return the JSON Schema of the message."""
     return StateMessage.model_json_schema() | {"$id": SCHEMA}
 
 
-def _input(item: Any, value: float) -> PublishedInput:
+def _input(item: Input, value: float) -> PublishedInput:
     low, high = item.fitted or (-math.inf, math.inf)
     why = "" if math.isfinite(value) else "the input is not a number"
     if not why and is_outside(item, value):

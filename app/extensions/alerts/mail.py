@@ -7,7 +7,6 @@ import socket
 import ssl
 from email.message import EmailMessage
 from pathlib import Path
-from typing import Any
 
 from app.engine.outputs.alerts import AlertMessage
 from app.engine.outputs.receivers import TIMEOUT_S, Deadline
@@ -21,7 +20,7 @@ class PlainMail(smtplib.SMTP):
 
     sockets: list[socket.socket]
 
-    def _get_socket(self, *args: Any) -> socket.socket:
+    def _get_socket(self, *args: object) -> socket.socket:
         sock: socket.socket = super()._get_socket(*args)  # type: ignore[misc]
         self.sockets.append(sock.dup())
         return sock
@@ -47,7 +46,7 @@ class Mail:
         mail.set_content("\n".join([*lines, alert.link or alert.guide, "", alert.model_dump_json(indent=2)]))
         context, deadline = ssl.create_default_context(), Deadline()
         kind = SecureMail if section.security == "tls" else PlainMail
-        given: dict[str, Any] = {"context": context} if section.security == "tls" else {}
+        given: dict[str, object] = {"context": context} if section.security == "tls" else {}
         # A class of its own for each mail: the constructor connects, so the list cannot be given afterwards.
         connected = type(kind.__name__, (kind,), {"sockets": deadline.sockets})
         try:

@@ -6,7 +6,7 @@ import os
 import time
 from contextlib import suppress
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import IO, Any, NamedTuple
 
 import numpy as np
 
@@ -127,7 +127,7 @@ class ParquetPart:
             self._path.unlink(missing_ok=True)
 
 
-def lock(file: Any) -> bool:
+def lock(file: IO[bytes]) -> bool:
     """Lock a file for this process; return whether no other one has it."""
     try:
         import fcntl

@@ -4,16 +4,14 @@ from __future__ import annotations
 
 import sys
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 from app.render.text import to_text
-from app.result import Topic, to_json
+from app.result import Cell, Topic, to_json
 from estimators.errors import ConfigError, nearest
 
+from .arguments import QueryCommand
 from .parts import parts_of
-
-if TYPE_CHECKING:
-    from .arguments import QueryCommand
 
 ALL = "archive"
 """View with the rows of all twins."""
@@ -83,7 +81,7 @@ def _quoted(text: str, mark: str) -> str:
     return f"{mark}{text.replace(mark, 2 * mark)}{mark}"
 
 
-def _cell(value: Any) -> Any:
+def _cell(value: object) -> Cell:
     """Return a value for a table: numbers as they are, anything else as text."""
     if value is None or isinstance(value, (int, float)) and not isinstance(value, bool):
         return value

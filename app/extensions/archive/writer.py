@@ -10,24 +10,25 @@ import threading
 import time
 from contextlib import suppress
 from functools import partial
-from typing import TYPE_CHECKING, Any
+from pathlib import Path
+from typing import TYPE_CHECKING
 
 import numpy as np
 
 from app.engine.copies import Pull
 from app.engine.history_copy import last_written
 from app.engine.jobs import LoopThread
+from app.engine.running_fold import Running, StoredTwin
+from app.record.rrd_file import Split
 from estimators.events.batch import MAINTENANCE
 from estimators.interface.table import table_of
+from estimators.log import Events
 from sources.worker_process import gist
 
 from .parts import DAY_NS, GROUP_ROWS, ArchivePlan, ParquetPart, parts_of, remove_surplus
 
 if TYPE_CHECKING:
-    from pathlib import Path
-
-    from app.engine.running_fold import Running, StoredTwin
-    from app.record.rrd_file import Split
+    from pyarrow import Table
 
 PERIOD_S, IDLE_PERIOD_S = 0.05, 1.0
 """Seconds between two looks for rows, at least and, while there are none, at most."""
@@ -154,7 +155,7 @@ class Archive:
             if self._part.size >= self._split.size:
                 self._finish()
 
-    def _table(self, pull: Pull, piece: slice) -> Any:
+    def _table(self, pull: Pull, piece: slice) -> Table:
         """Return rows as a table: the columns of `nisus fold --out`, and those of the archive."""
         import pyarrow as pa
 
@@ -207,7 +208,7 @@ class _Versions:
         self._changes: list[tuple[int, int]] = []
         """Row and time of each maintenance event."""
 
-    def before(self, first: int, events: Any) -> int:
+    def before(self, first: int, events: Events) -> int:
         """Return the version before the row `first`, with which `events` begin, and note their maintenance."""
         self._changes = [change for change in self._changes if change[0] < first]
         times = {t for _, t in self._changes}

@@ -2,17 +2,13 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
-
 from app.cli.prepare import attend, prepared
 from app.result import to_json
 from app.twin.log_reader import read_log
 from estimators.errors import ConfigError
 
+from .arguments import ExportCommand as Arguments
 from .filter import export_c
-
-if TYPE_CHECKING:
-    from .arguments import ExportCommand as Arguments
 
 
 def export_filter(arguments: Arguments) -> int:

@@ -44,11 +44,11 @@ NUMPY = {
 """NumPy's names of operations, where they are others."""
 
 
-COMPARISONS: dict[str, Callable[[Any, Any], bool]] = {
+COMPARISONS: dict[str, Callable[..., bool]] = {
     "<": operator.lt, "<=": operator.le, ">": operator.gt, ">=": operator.ge, "==": operator.eq, "!=": operator.ne,
 }  # fmt: skip
 
-ARITHMETIC: dict[str, Callable[[Any, Any], Any]] = {
+ARITHMETIC: dict[str, Callable[..., float]] = {
     "+": operator.add, "-": operator.sub, "*": operator.mul, "/": lambda a, b: float(np.float64(a) / np.float64(b)),
 }  # fmt: skip
 """Operations on numbers, and COMPARISONS; those by other names are functions of `math`."""
@@ -92,7 +92,7 @@ class Term:
         """Its value, if it is known."""
         return self.of[0] if self.operation == "constant" else None
 
-    def _with(self, operation: str, *of: Any) -> Term:
+    def _with(self, operation: str, *of: object) -> Term:
         return self.reader.term(operation, *of)
 
     def __array_ufunc__(self, ufunc: Any, method: str, *inputs: Any, **_: Any) -> Any:
@@ -129,7 +129,7 @@ class Term:
     def __hash__(self) -> int:
         return id(self)
 
-    def __pow__(self, power: Any) -> Term:
+    def __pow__(self, power: object) -> Term:
         if isinstance(power, (int, float)) and power == int(power) and 1 <= power <= 8:
             result = self
             for _ in range(int(power) - 1):
@@ -137,7 +137,7 @@ class Term:
             return result
         return self._with("pow", self, power)
 
-    def __rpow__(self, base: Any) -> Term:
+    def __rpow__(self, base: object) -> Term:
         return self._with("pow", base, self)
 
     def __mod__(self, other: Any) -> Term:
@@ -159,8 +159,8 @@ class Term:
 def _operators() -> None:
     """Give `Term` Python's operators, each also with the term on the right."""
 
-    def made(symbol: str, swapped: bool) -> Callable[[Term, Any], Any]:
-        def operator(self: Term, other: Any) -> Any:
+    def made(symbol: str, swapped: bool) -> Callable[[Term, object], object]:
+        def operator(self: Term, other: object) -> object:
             if isinstance(other, np.ndarray) and other.ndim:
                 return NotImplemented
             return self._with(symbol, *((other, self) if swapped else (self, other)))
@@ -190,12 +190,12 @@ class Reader:
     """Runs a model's functions on symbols; terms that are equal are one."""
 
     def __init__(self) -> None:
-        self._terms: dict[tuple[Any, ...], Term] = {}
+        self._terms: dict[tuple[object, ...], Term] = {}
         self._given: tuple[tuple[Term, bool], ...] = ()  # choices of the callers
         self._path: list[tuple[Term, bool]] = []
         self._wanted: list[bool] = []
-        self._functions: dict[int, Any] = {}
-        self._kept: list[Any] = []  # functions whose id is a key must live
+        self._functions: dict[int, Callable[..., object]] = {}
+        self._kept: list[FunctionType] = []  # functions whose id is a key must live
 
     def symbols(self, name: str, size: int) -> np.ndarray:
         """Return the vector of the symbols name[0], name[1], …."""
@@ -255,7 +255,7 @@ class Reader:
         self._path.append((condition, outcome))
         return outcome
 
-    def read(self, function: Callable, arguments: Sequence[Any], shape: tuple[int, ...]) -> np.ndarray:
+    def read(self, function: Callable, arguments: Sequence[object], shape: tuple[int, ...]) -> np.ndarray:
         """Return `out` of this shape as terms, as function(*arguments, out) fills it.
 
         Raises:
@@ -272,7 +272,7 @@ class Reader:
             raise ModelError(f"{name} cannot be read as formulas: {error}") from None
         return self._vector([self._term(item) for item in out.ravel()]).reshape(shape)
 
-    def _along_all(self, function: Callable, arguments: Sequence[Any]) -> Any:
+    def _along_all(self, function: Callable, arguments: Sequence[object]) -> object:
         """Run a function along all ways through it; return and leave in its arrays what depends on the way as a choice.
 
         Raises:
@@ -282,7 +282,7 @@ class Reader:
         before = [item.copy() for item in arrays]
         paths = 0
 
-        def along(wanted: list[bool]) -> tuple[Any, list[np.ndarray]]:
+        def along(wanted: list[bool]) -> tuple[object, list[np.ndarray]]:
             nonlocal paths
             paths += 1
             if paths > MAX_PATHS:
@@ -315,7 +315,7 @@ class Reader:
                 item[...] = values
         return result
 
-    def _chosen(self, condition: Term, a: Any, b: Any) -> Any:
+    def _chosen(self, condition: Term, a: object, b: object) -> object:
         if isinstance(a, tuple) and isinstance(b, tuple) and len(a) == len(b):
             return tuple(self._chosen(condition, one, other) for one, other in zip(a, b, strict=True))
         if a is b or (type(a) is type(b) and not isinstance(a, (Term, np.ndarray)) and a == b):
@@ -334,10 +334,10 @@ class Reader:
             found[k] = item
         return found
 
-    def _merging(self, function: Callable) -> Callable[..., Any]:
+    def _merging(self, function: Callable) -> Callable[..., object]:
         """Return a function whose choices end with its call, unless what it returns cannot be merged."""
 
-        def call(*arguments: Any) -> Any:
+        def call(*arguments: object) -> object:
             try:
                 return self._along_all(function, arguments)
             except UnmergedError:
@@ -345,7 +345,7 @@ class Reader:
 
         return call
 
-    def _readable(self, function: Any, *, called: bool = True) -> Any:
+    def _readable(self, function: object, *, called: bool = True) -> Any:
         """Return the function with plain ones in place of the compiled ones that it calls, and `math` for symbols."""
         if isinstance(function, ModuleType) and function.__name__ in ("math", "cmath"):
             return SimpleNamespace(**{**vars(math), **{name: self._function(name) for name in FUNCTIONS}})
@@ -368,8 +368,8 @@ class Reader:
             cell.cell_contents = self._readable(given.cell_contents)
         return self._functions[id(inner)] if called else made
 
-    def _function(self, name: str) -> Callable[..., Any]:
-        def apply(*of: Any) -> Any:
+    def _function(self, name: str) -> Callable[..., object]:
+        def apply(*of: Term | float) -> object:
             if any(isinstance(item, Term) for item in of):
                 return self.term(name, *of)
             return getattr(math, name)(*of)
@@ -386,7 +386,7 @@ class Reader:
             found[:, j] = [known[id(item)] for item in outputs]
         return found
 
-    def _derivative(self, term: Term, symbol: Term, known: Mapping[int, Term]) -> Any:
+    def _derivative(self, term: Term, symbol: Term, known: Mapping[int, Term]) -> Term:
         if term is symbol:
             return self.constant(1.0)
         if term.operation in ("symbol", "constant", "floor") or term.operation in COMPARISONS:

@@ -6,7 +6,7 @@ import sys
 import time
 from collections import Counter
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 from app.cli.options import overrides_of
 from app.result import to_json
@@ -15,8 +15,7 @@ from app.twin.sources.can import make_player
 from app.twin.twin import Twin, load_twin
 from estimators.errors import ConfigError
 
-if TYPE_CHECKING:
-    from .arguments import BusCommand
+from .arguments import BusCommand
 
 GROUP = "239.74.163.2"  # python-can's own multicast address
 

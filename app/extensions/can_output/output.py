@@ -9,21 +9,22 @@ from __future__ import annotations
 import re
 import struct
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 from app.engine.copies import OutputLink
 from app.engine.outputs.state_message import StateMessage
+from app.engine.running_fold import Running
+from app.twin.secrets import Secrets
 from app.twin.sources.kind import find_databases
 from config.source_schema import CanLogSection, CanSection
 from estimators.diagnostics.references import WITHHELD
 from estimators.errors import ConfigError, printable
 from estimators.track import HEALTH_NAMES
 
-if TYPE_CHECKING:
-    from app.engine.running_fold import Running
-    from app.twin.secrets import Secrets
+from .schema import CanOutputSection
 
-    from .schema import CanOutputSection
+if TYPE_CHECKING:
+    from can import BusABC
 
 FRAME = struct.Struct("<fBBB")
 """Value; counter (low four bits) and grade; validity; age in steps of 10 ms, 255 for 2.55 s and more."""
@@ -77,7 +78,7 @@ class CanOutput:
                     f"give another id, of which {2 * len(self._names)} from there on are free"
                 )
         self._write(engine.twin.path.absolute().parent / section.dbc)
-        self._bus: Any = None
+        self._bus: BusABC | None = None
         self._counter = 0
         self._problem = "not open yet"
 
@@ -155,7 +156,7 @@ def listened(engine: Running) -> dict[int, str]:
         return {}
     found: dict[int, str] = {}
     for path, _ in find_databases(engine.twin.loaded, section, ("source",)):
-        database: Any = cantools.database.load_file(path, strict=False)
+        database = cantools.database.load_file(path, strict=False)
         found |= {message.frame_id: message.name for message in database.messages}
     return found
 

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import Annotated, Any
+from typing import Annotated
 
 from pydantic import Field
 
@@ -16,7 +16,7 @@ class CanOutputSection(Section):
     """Interface of python-can: socketcan, virtual, udp_multicast, ..."""
     channel: Annotated[int, Field(strict=True)] | str
     """Channel of the interface."""
-    options: dict[str, Any] = {}
+    options: dict[str, object] = {}
     """Further arguments of python-can's interface. Default: none."""
     id: Annotated[int, Field(strict=True, ge=0, le=0x1FFFFFFF)]
     """Identifier of the first frame; each state takes two. None may be one of the source's databases."""

@@ -25,10 +25,10 @@ any byte, and NumPy sums those in another order: not the same bits."""
 
 MAX_KEPT = 4  # functions that a worker keeps, the last ones
 
-_functions: list[Callable[..., Any]] = []
+_functions: list[Callable[..., object]] = []
 """Model functions of the twin that this worker has loaded."""
 
-_kept: dict[str, Callable[..., Any]] = {}
+_kept: dict[str, Callable[..., object]] = {}
 """Functions that were sent to this worker, by key."""
 
 
@@ -45,17 +45,17 @@ class ClusterExecutor(Executor):
     A model has local functions and machine code, which cannot be pickled: a worker uses those of its own twin.
     """
 
-    def __init__(self, cluster: Cluster, functions: list[Callable[..., Any]]) -> None:
+    def __init__(self, cluster: Cluster, functions: list[Callable[..., object]]) -> None:
         """Take the workers of a cluster, and the functions that they have, too."""
         self._cluster, self._functions = cluster, functions  # pickled by their places in this list
-        self._sent: dict[Any, tuple[Callable[..., Any], Any]] = {}
-        self._seconds: dict[Any, float] = {}
+        self._sent: dict[object, tuple[Callable[..., object], object]] = {}
+        self._seconds: dict[object, float] = {}
 
-    def submit(self, fn: Callable[..., Any], /, *given: Any, **named: Any) -> Future[Any]:
+    def submit(self, fn: Callable[..., object], /, *given: Any, **named: Any) -> Future[Any]:
         """Submit one call."""
         return self._cluster.submit(_call, packed(partial(fn, *given, **named), self._functions))
 
-    def map(self, fn: Callable[..., Any], *iterables: Iterable[Any], **_: Any) -> Iterator[Any]:
+    def map(self, fn: Callable[..., object], *iterables: Iterable[Any], **_: object) -> Iterator[Any]:
         """Submit all calls, and return their results in order; calls that have not begun are cancelled at the end."""
         items = list(zip(*iterables, strict=False))
         # A partial of the same objects is the same function. Keeping it keeps their identities.
@@ -66,13 +66,13 @@ class ClusterExecutor(Executor):
         first = len(items) if key in self._seconds else max(1, self._cluster.workers())
         return self._results(key, self._tasks(key, items[:first]), items[first:])
 
-    def _tasks(self, key: Any, items: list[tuple[Any, ...]]) -> list[Future[Any]]:
+    def _tasks(self, key: object, items: list[tuple[object, ...]]) -> list[Future[tuple[float, bytes]]]:
         share = -(-len(items) // max(1, self._cluster.workers()))
         count = max(1, min(share, round(TASK_S / max(self._seconds.get(key, TASK_S), 1e-6))))
         parts = [items[k : k + count] for k in range(0, len(items), count)]
         return [self._cluster.submit(_calls, self._sent[key][1], part) for part in parts]
 
-    def _results(self, key: Any, futures: list[Future[Any]], rest: list[tuple[Any, ...]]) -> Iterator[Any]:
+    def _results(self, key: object, futures: list[Future[Any]], rest: list[tuple[object, ...]]) -> Iterator[Any]:
         try:
             for future in futures:
                 self._seconds[key], found = future.result()
@@ -85,7 +85,7 @@ class ClusterExecutor(Executor):
                 future.cancel()
 
 
-def functions_of(item: Any) -> list[Callable[..., Any]]:
+def functions_of(item: object) -> list[Callable[..., object]]:
     """Return the functions in a model, in the order of its fields."""
     if callable(item):
         return [item]
@@ -96,14 +96,14 @@ def functions_of(item: Any) -> list[Callable[..., Any]]:
     return [function for part in fields(item) for function in functions_of(getattr(item, part.name))]
 
 
-def packed(value: Any, functions: list[Callable[..., Any]]) -> bytes:
+def packed(value: object, functions: list[Callable[..., object]]) -> bytes:
     """Return a pickle in which functions are places in a list that the receiver has, too."""
     from cloudpickle import Pickler  # type: ignore[import-untyped]  # comes with Dask
 
     places = {id(function): k for k, function in enumerate(functions)}
 
     class Packer(Pickler):  # type: ignore[misc]
-        def persistent_id(self, item: Any) -> int | None:
+        def persistent_id(self, item: object) -> int | None:
             return places.get(id(item)) if callable(item) else None
 
     file = io.BytesIO()
@@ -111,11 +111,11 @@ def packed(value: Any, functions: list[Callable[..., Any]]) -> bytes:
     return file.getvalue()
 
 
-def unpacked(data: bytes, functions: list[Callable[..., Any]]) -> Any:
+def unpacked(data: bytes, functions: list[Callable[..., object]]) -> Any:
     """Return what `packed` has packed."""
 
     class Unpacker(pickle.Unpickler):
-        def persistent_load(self, place: int) -> Any:
+        def persistent_load(self, place: int) -> object:
             return functions[place]
 
     return Unpacker(io.BytesIO(data)).load()
@@ -127,11 +127,11 @@ def _load(name: str, overrides: dict[str, str]) -> None:
     _kept.clear()
 
 
-def _call(data: bytes) -> Any:
+def _call(data: bytes) -> object:
     return unpacked(data, _functions)()
 
 
-def _calls(sent: tuple[str, bytes], items: list[tuple[Any, ...]]) -> tuple[float, bytes]:
+def _calls(sent: tuple[str, bytes], items: list[tuple[object, ...]]) -> tuple[float, bytes]:
     """Return the seconds of a call and the results of all, pickled."""
     key, data = sent
     if key not in _kept:

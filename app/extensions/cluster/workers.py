@@ -35,18 +35,17 @@ _turn, _begun = threading.Lock(), [""]
 class Cluster:
     """Workers of a Dask cluster."""
 
-    def __init__(self, client: Any, begin: Callable[..., None], given: tuple[Any, ...]) -> None:
+    def __init__(self, client: Any, begin: Callable[..., None], given: tuple[object, ...]) -> None:
         """Take a client; `begin` is called with `given` on each worker before its first call."""
         self._client, self._executor = client, client.get_executor(pure=False)
         self._command = uuid.uuid4().hex, version("nisus"), os.getcwd()
         self._begin, self._closed, self.deserted = self.hold((begin, given)), threading.Event(), False
 
-    def submit(self, work: Callable[..., Any], *call: Any) -> Future[Any]:
+    def submit(self, work: Callable[..., object], *call: object) -> Future[Any]:
         """Submit a call; another worker makes it again if one dies. Its arguments may be held."""
-        found: Future[Any] = self._executor.submit(_on_worker, self._command, self._begin, work, *call)
-        return found
+        return self._executor.submit(_on_worker, self._command, self._begin, work, *call)
 
-    def hold(self, value: Any) -> Any:
+    def hold(self, value: object) -> object:
         """Send a value to the cluster: to each worker with its first call that has it among its arguments."""
         # A task rather than data: it is made again if the worker that holds it dies.
         return self._client.submit(_same, value, pure=False)
@@ -75,7 +74,7 @@ class Cluster:
 
 
 @contextmanager
-def dask(address: str, begin: Callable[..., None], given: tuple[Any, ...]) -> Iterator[Cluster]:
+def dask(address: str, begin: Callable[..., None], given: tuple[object, ...]) -> Iterator[Cluster]:
     """Context manager: the workers of a cluster; for the arguments and errors see `app.study.processes.results`."""
     try:
         from distributed import Client, LocalCluster
@@ -140,9 +139,9 @@ def dask(address: str, begin: Callable[..., None], given: tuple[Any, ...]) -> It
 
 
 def _on_worker(
-    command: tuple[str, str, str], held: tuple[Callable[..., None], tuple[Any, ...]], work: Callable[..., Any],
-    *call: Any,
-) -> Any:  # fmt: skip
+    command: tuple[str, str, str], held: tuple[Callable[..., None], tuple[object, ...]], work: Callable[..., object],
+    *call: object,
+) -> object:  # fmt: skip
     """Make a call on a worker, which may have threads and serve other commands; `begin` sets variables of a module."""
     name, wanted, folder = command
     if version("nisus") != wanted:
@@ -162,5 +161,5 @@ def _on_worker(
         return work(*call)
 
 
-def _same(value: Any) -> Any:
+def _same(value: object) -> object:
     return value

@@ -6,7 +6,6 @@ import hashlib
 import time
 from collections.abc import Callable, Sequence
 from functools import partial
-from typing import Any
 
 import numpy as np
 from pydantic import BaseModel, ConfigDict, Field
@@ -15,6 +14,7 @@ from app.engine.outputs.alarm_guide import advice
 from app.engine.outputs.alerts import FIRING, REPEATED, RESOLVED, SETTLE_S, AlertMessage, numbered
 from app.engine.outputs.state_message import iso_now
 from app.format_time import counted
+from app.result import JsonObject
 from estimators.diagnostics.detectors import anchor
 from estimators.errors import printable
 from estimators.fleet.table import FleetTable
@@ -111,7 +111,7 @@ class FleetRule:
             del self._absent[name]
         return self._message(names, table, fired, recovered, gone)
 
-    def state(self, now: float) -> dict[str, Any] | None:
+    def state(self, now: float) -> JsonObject | None:
         """Return the open alert, for JSON; None if there is none."""
         told = [*(self._names[k] for k in np.flatnonzero(self._told).tolist()), *self._absent]
         if not told:
@@ -119,7 +119,7 @@ class FleetRule:
         known = {"id": self._id, "since": self._since, "sent": now - self._sent, "assets": told}
         return known | {"rule": self.rule.model_dump(mode="json", exclude_unset=True)}
 
-    def restore(self, state: dict[str, Any], ago: float, now: float, removed: bool) -> None:
+    def restore(self, state: JsonObject, ago: float, now: float, removed: bool) -> None:
         """Continue with an open alert, before the first look; `ago`: seconds since its `state`."""
         self._id, self._since, self._sent = str(state["id"]), str(state["since"]), now - ago - state["sent"]
         self._absent = dict.fromkeys(map(str, state["assets"]))
@@ -195,13 +195,13 @@ class FleetRules:
         found = [(item.rule, item.evaluate(names, table, now)) for item in self._rules.values()]
         return [(rule, message) for rule, message in found if message is not None]
 
-    def state(self) -> list[Any]:
+    def state(self) -> list[tuple[tuple[str, ...], JsonObject]]:
         """Return the open alerts, for JSON."""
         now = self._clock()
         states = [(key, rule.state(now)) for key, rule in self._rules.items()]
         return [(key, state) for key, state in states if state is not None]
 
-    def restore(self, state: Sequence[Any], ago: float) -> None:
+    def restore(self, state: Sequence[tuple[Sequence[str], JsonObject]], ago: float) -> None:
         """Continue with open alerts as `AlertRules.restore` does, before the first look."""
         now = self._clock()
         for key, item in state:

@@ -6,7 +6,7 @@ import threading
 from collections import OrderedDict
 from collections.abc import Iterator
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 from starlette.responses import Response
@@ -14,6 +14,7 @@ from starlette.routing import BaseRoute, Mount
 from starlette.staticfiles import StaticFiles
 
 from app.extensions.service.metrics import exposed
+from app.result import JsonObject
 from app.web import readings
 from app.web.http import get, page_file
 from estimators.errors import ConfigError, nearest
@@ -90,7 +91,7 @@ class FleetApi:
         column: str = "",
         differs: bool = False,
         version: int = -1,
-    ) -> dict[str, Any]:
+    ) -> JsonObject:
         """Return a part of the table of all assets, in an order, with counts by health and a histogram of a column.
 
         `sort` is health, asset, or a column; `find` words in the name of an asset; `health` one grade; `differs` asks
@@ -124,7 +125,7 @@ class FleetApi:
             "rows": [self._row(table, place) for place in part.tolist()],
         }  # fmt: skip
 
-    def _row(self, table: FleetTable, place: int) -> dict[str, Any]:
+    def _row(self, table: FleetTable, place: int) -> JsonObject:
         numbers = [*table.mean[place], *table.std[place], table.nis_mean[place], table.nis_low[place],
                    table.nis_high[place], table.seconds[place] - table.since[place], table.age[place]]  # fmt: skip
         health, cause = HEALTH_NAMES[table.health[place]], str(table.cause[place])

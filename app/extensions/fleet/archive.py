@@ -10,24 +10,26 @@ from __future__ import annotations
 
 import os
 import threading
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterator, Sequence
 from contextlib import contextmanager, suppress
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import numpy as np
 
 from app.engine.jobs import LoopThread
 from app.extensions.archive.parts import DAY_NS, ArchivePlan, number_of, parts_of, remove_surplus
+from app.result import JsonObject
 from estimators.errors import SourceError
 from estimators.events.batch import KIND_NAMES, READING, Events
+from estimators.model.state_space import StateSpaceModel
 from sources.source import Report
 from sources.worker_process import gist
 
 from .journal import JOURNAL, Journal, complete_journal, complete_journals, read_journal
 
 if TYPE_CHECKING:
-    from estimators.model.state_space import StateSpaceModel
+    from pyarrow import Table
 
 WRITE_PERIOD_S, RETRY_PERIOD_S = 1.0, 10.0
 """Seconds between two writes to the journal, and to the next attempt after a failure."""
@@ -45,7 +47,7 @@ class FleetArchive:
         model: StateSpaceModel,
         names: Sequence[str],
         report: Report,
-        stored: Mapping[str, Any] | None = None,
+        stored: JsonObject | None = None,
     ) -> None:
         """Prepare; nothing is written yet.
 
@@ -58,7 +60,7 @@ class FleetArchive:
         """
         self._folder, self._split = plan
         self._model, self._names, self._report = model, names, report
-        self._stored: dict[str, Any] = {"store": os.urandom(8).hex(), "number": 0, "end": 0} | dict(stored or {})
+        self._stored: JsonObject = {"store": os.urandom(8).hex(), "number": 0, "end": 0} | (stored or {})
         """Id of the store, number of the journal that was written with it last, and its length."""
         self._waiting: list[tuple[Sequence[str], np.ndarray, Events]] = []
         """Names of assets, the place of each event's among these, and the events."""
@@ -100,7 +102,7 @@ class FleetArchive:
         self.write(closing=True)
 
     @contextmanager
-    def written(self, rows: Sequence[tuple[np.ndarray, Events]]) -> Iterator[Mapping[str, Any]]:
+    def written(self, rows: Sequence[tuple[np.ndarray, Events]]) -> Iterator[JsonObject]:
         """Append events of assets at positions (N,) to the journal, for a transaction of the store in this context.
 
         Yields what the transaction must have: a process that continues from it cuts the journal there. Rows that cannot
@@ -192,7 +194,7 @@ class FleetArchive:
         self._journal = None
 
 
-def rows_of(model: StateSpaceModel, names: Sequence[str], at: np.ndarray, events: Events) -> Any:
+def rows_of(model: StateSpaceModel, names: Sequence[str], at: np.ndarray, events: Events) -> Table:
     """Return events of assets as a pyarrow.Table; columns as of the archive of a twin, and `asset`.
 
     Columns: `asset`, `t_ns`, `arrival_ns`, `event`, `channel`, `sensor` (null unless a measurement), `value_k`.
@@ -201,7 +203,7 @@ def rows_of(model: StateSpaceModel, names: Sequence[str], at: np.ndarray, events
 
     used, code = np.unique(at, return_inverse=True)
     channel = np.where(events.kind == READING, events.channel, len(model.sensor_names))
-    columns: dict[str, Any] = {
+    columns: dict[str, object] = {
         "asset": pa.array([names[k] for k in used.tolist()], pa.string()).take(pa.array(code)),
         "t_ns": events.t,
         "arrival_ns": events.arrival,
@@ -222,7 +224,7 @@ class AssetHistory:
         self._read = 0, 0
         """Number of the last file, and how many rows of it were read."""
 
-    def read(self, most: int) -> Any:
+    def read(self, most: int) -> Table | None:
         """Return the rows since the last call in the order of time as a pyarrow.Table; None if there are none.
 
         Args:
@@ -247,7 +249,7 @@ class AssetHistory:
         return None if table is None or not table.num_rows else table.sort_by("t_ns")
 
 
-def _pieces(folder: Path, asset: str, first: int) -> Iterator[tuple[int, Any]]:
+def _pieces(folder: Path, asset: str, first: int) -> Iterator[tuple[int, Table]]:
     """Yield number and rows of an asset of each file, the newest first; those from the number `first` on."""
     import pyarrow.compute as pc
 
@@ -265,7 +267,7 @@ def _pieces(folder: Path, asset: str, first: int) -> Iterator[tuple[int, Any]]:
             yield number_of(path), _rows_of_part(path, asset)
 
 
-def _rows_of_part(path: Path, asset: str) -> Any:
+def _rows_of_part(path: Path, asset: str) -> Table:
     import pyarrow as pa
     import pyarrow.compute as pc
     import pyarrow.parquet

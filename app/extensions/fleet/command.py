@@ -10,7 +10,7 @@ from collections.abc import Mapping
 from contextlib import suppress
 from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 from app.cli.options import overrides_of
 from app.cli.prepare import attend, compile_for
@@ -24,23 +24,24 @@ from app.render.track_file import encoded
 from app.result import to_json
 from app.terminal import complain, until_asked_to_end
 from app.twin.log_reader import remarking
+from app.web.http_server import HttpServer
 from config.yaml_files import writing
 from estimators.errors import ConfigError, NisusError, SourceError
 from estimators.fleet.table import FleetTable
 
 from .api import FleetApi
 from .archive import AssetHistory, FleetArchive
+from .arguments import FleetCommand
 from .plan import FleetPlan, load_fleet
 from .publisher import FleetPublisher
 from .running import STOPPED, STORE, RunningFleet
 from .table import arrow_table, counts_of, fleet_topics, in_name_order, ordered
 
 if TYPE_CHECKING:
-    from app.web.http_server import HttpServer
+    from pyarrow import Table
+
     from app.web.running import OpenedTwin
     from app.web.session import Session
-
-    from .arguments import FleetCommand
 
 FLEET_PRELOADED = (*PRELOADED, __name__, "pyarrow.dataset", "pyarrow.parquet")
 """Modules that the processes of a fleet and its pages share."""
@@ -143,13 +144,13 @@ def print_problem(key: str, text: str) -> None:
         complain(text)
 
 
-def follow(history: AssetHistory, rows: Any, folder: Path, most: int) -> threading.Event:
+def follow(history: AssetHistory, rows: Table, folder: Path, most: int) -> threading.Event:
     """Write rows of an asset into a file of a folder, and later ones into others, in a thread until it is ended."""
     import pyarrow.parquet
 
     numbers, ended = itertools.count(), threading.Event()
 
-    def write(rows: Any) -> None:
+    def write(rows: Table) -> None:
         if rows is not None:
             pyarrow.parquet.write_table(rows, folder / f"{next(numbers):08d}.parquet")
 
@@ -168,7 +169,7 @@ def follow(history: AssetHistory, rows: Any, folder: Path, most: int) -> threadi
 
 def _opened(
     fleet: Path, overrides: Mapping[str, str], recordings: Path, archived: Path | None, name: str, asset: str
-) -> tuple[Session, Mapping[str, Any]]:
+) -> tuple[Session, Mapping[str, object]]:
     """Open the history of an asset."""
     from app.cli.open_twin import FileOpener, open_session, opened_twin
     from app.web.gallery.gallery import StartRequest

@@ -4,12 +4,12 @@ from __future__ import annotations
 
 import os
 import time
-from collections.abc import Mapping
 from contextlib import suppress
 from pathlib import Path
 from typing import Any
 
 from app.extensions.archive.parts import DAY_NS, ParquetPart, lock, number_of, parts_of
+from app.result import JsonObject
 from estimators.errors import SourceError
 
 JOURNAL = ".arrows"
@@ -80,7 +80,7 @@ class Journal:
         self._file.close()
 
 
-def complete_journals(folder: Path, stored: Mapping[str, Any] | None = None) -> None:
+def complete_journals(folder: Path, stored: JsonObject | None = None) -> None:
     """Make a Parquet file of each journal; those of a store are cut to the length that it has.
 
     Args:
@@ -95,7 +95,7 @@ def complete_journals(folder: Path, stored: Mapping[str, Any] | None = None) -> 
         complete_journal(path, stored)
 
 
-def complete_journal(path: Path, stored: Mapping[str, Any] | None = None) -> None:
+def complete_journal(path: Path, stored: JsonObject | None = None) -> None:
     """Make a Parquet file of a journal, with its rows in the order of the assets; see `complete_journals`."""
     import pyarrow.compute as pc
 

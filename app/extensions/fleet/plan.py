@@ -7,10 +7,10 @@ import re
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from app.result import JsonObject
 from app.twin.channels import channels
 from app.twin.checks import check_receivers
 from app.twin.secrets import secret
@@ -23,15 +23,12 @@ from config.problems import check_section
 from config.yaml_files import as_flow, read_text
 from estimators.errors import ConfigError, EstimatorError
 from estimators.fleet.fleet import Fleet
+from sources.source import Report, Source
 from sources.tables.text import column_of
 
 from .one_asset import rows_of_asset
 from .schema import FleetSection, FleetTableSection
 from .tunings import AssetValues, asset_values
-
-if TYPE_CHECKING:
-    from sources.source import Report, Source
-
 
 WINDOWS_S = (60, 300, 900, 3600, 21_600, 86_400)
 """Widths of the charts of an asset, s."""
@@ -139,10 +136,10 @@ class FleetPlan:
         """
         model = self.twin.model
 
-        def only(event: str, channel: int, columns: Iterable[str]) -> dict[str, Any]:
+        def only(event: str, channel: int, columns: Iterable[str]) -> JsonObject:
             return {"columns": [*columns], "only": {"event": {"text": [event]}, "channel": channel}}
 
-        given: dict[str, Any] = {"type": "table", "files": [str(folder.absolute() / "*.parquet")], "follow": True}
+        given: JsonObject = {"type": "table", "files": [str(folder.absolute() / "*.parquet")], "follow": True}
         given["time"] = {"column": "t_ns", "unit": "ns"}
         sensors = {
             sensor.name: only("reading", k, (f"value_{row}" for row in range(len(sensor.rows))))
@@ -152,7 +149,7 @@ class FleetPlan:
         window = next((width for width in WINDOWS_S if width >= span), WINDOWS_S[-1])
         return {"view.window": str(window)} | self._overrides(asset, given | {"sensors": sensors, "inputs": inputs})
 
-    def _overrides(self, asset: str, source: Mapping[str, Any]) -> dict[str, str]:
+    def _overrides(self, asset: str, source: Mapping[str, object]) -> dict[str, str]:
         """Return the overrides of the twin's YAML for one asset with its own tuning and a source."""
         name = re.sub(r"[^A-Za-z0-9_-]", "_", asset).lstrip("_-") or "asset"
         own = {key: repr(value) for key, value in self.values.of(asset).items()}

@@ -12,7 +12,7 @@ from contextlib import AbstractContextManager, nullcontext
 from dataclasses import replace
 from importlib.metadata import version
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, NamedTuple, Protocol
+from typing import Any, NamedTuple, Protocol
 
 import numpy as np
 
@@ -20,10 +20,11 @@ from app.engine.fold_json import tuning_to_json
 from app.engine.jobs import LoopThread
 from app.engine.outcomes import Outcomes
 from app.engine.store import RETRY_PERIOD_S, Store
+from app.result import JsonObject
 from app.twin.ingest import CLOCK_MOVED, clock_lines, refusal
 from app.twin.twin import Twin
 from estimators.errors import SourceError, is_blank, quoted, reason_of
-from estimators.events.clocks import ClockGuard
+from estimators.events.clocks import ClockGuard, Passed
 from estimators.fleet.table import FleetTable
 from estimators.log import BEFORE, READING, Events
 from estimators.track import STALE
@@ -32,9 +33,6 @@ from sources.source import NO_ASSET, WRONG_TIME, Acknowledging, AssetEvents, Mar
 
 from .plan import FleetPlan
 from .silent_assets import SilentAssets
-
-if TYPE_CHECKING:
-    from estimators.events.clocks import Passed
 
 FIRST_ROOM = 256
 """Assets for which there is room at the start, unless their number is given; it is doubled as they come."""
@@ -73,7 +71,7 @@ class EventSink(Protocol):
     def append(self, at: np.ndarray, events: Events) -> None:
         """Take events of the assets at the positions `at` (N,), at once."""
 
-    def written(self, rows: Sequence[tuple[np.ndarray, Events]]) -> AbstractContextManager[Mapping[str, Any]]:
+    def written(self, rows: Sequence[tuple[np.ndarray, Events]]) -> AbstractContextManager[JsonObject]:
         """Write events for a transaction of the store in this context; yield what that must have."""
 
     def start(self) -> None:
@@ -158,7 +156,7 @@ class RunningFleet:
         self._due, self._asked, self._kept = 0.0, False, -1
         self._unwritten = False
         """Whether the store could not be written at the last attempt."""
-        self.archived: Mapping[str, Any] | None = None
+        self.archived: JsonObject | None = None
         """Numbers of the archive that the store has; None without a store, or without an archive in it."""
         self.end_publishing: Callable[[], None] = lambda: None
         """Called with the last state, before the store is closed, which has the alerts."""
@@ -381,7 +379,7 @@ class RunningFleet:
                 self._silent.query(silent, present[silent])
                 self.version += 1
 
-    def _identity(self) -> dict[str, Any]:
+    def _identity(self) -> JsonObject:
         """Return what a store must have been written with."""
         plan, model, given = self.plan, self.plan.twin.model, self.plan.config.assets
         names = [model.name, *model.state_names, *model.row_names, *(given if isinstance(given, tuple) else ())]
@@ -443,7 +441,7 @@ class RunningFleet:
 
     def _continue(self, store: Store) -> None:
         blocks = store.read_blocks("state", "assets", "last")
-        state: dict[str, Any] = json.loads(blocks.get(("state", 0), b"{}"))
+        state: JsonObject = json.loads(blocks.get(("state", 0), b"{}"))
         if state:
             for key, value in self._identity().items():
                 if state.get(key) != value:

@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 
 from app.format_time import counted
-from app.result import Cell, TableColumn, Topic
+from app.result import Cell, JsonObject, TableColumn, Topic
 from estimators.fleet.siblings import MIN_ASSETS, Siblings, siblings
 from estimators.fleet.table import FleetTable
 from estimators.model.state_space import StateSpaceModel
@@ -82,7 +82,7 @@ def matching(names: Sequence[str], words: str, within: np.ndarray) -> np.ndarray
     return within[found[within]]
 
 
-def histogram(values: np.ndarray) -> dict[str, Any] | None:
+def histogram(values: np.ndarray) -> JsonObject | None:
     """Return the edges and counts of a histogram of the finite values; None without any."""
     finite = values[np.isfinite(values)]
     if not finite.size:
@@ -113,7 +113,7 @@ def arrow_table(model: StateSpaceModel, table: FleetTable, order: np.ndarray | N
     import pyarrow as pa
 
     part = slice(None) if order is None else order
-    columns: dict[str, Any] = {
+    columns: dict[str, object] = {
         "asset": pa.array(np.array(table.assets, object)[part], pa.string()),
         "health": np.array(HEALTH_NAMES)[table.health[part]],
         "cause": pa.array([cause or None for cause in table.cause[part].tolist()], pa.string()),

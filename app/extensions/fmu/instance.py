@@ -17,16 +17,21 @@ import os
 import tempfile
 import threading
 import weakref
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager, suppress
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 from config.yaml_files import shown_path
 from estimators.errors import ModelError
 from sources.worker_process import gist
+
+if TYPE_CHECKING:
+    from fmpy.fmi2 import FMU2Model
+    from fmpy.fmi3 import FMU3Model
+    from fmpy.model_description import ModelDescription
 
 FATAL = 4
 """Status of a call after which no instance of the FMU may be used."""
@@ -46,7 +51,9 @@ class Fmu:
         ModelError: If it cannot be loaded.
     """
 
-    def __init__(self, path: Path, description: Any, nx: int, inputs: Sequence[int], parameters: Sequence[int]) -> None:
+    def __init__(
+        self, path: Path, description: ModelDescription, nx: int, inputs: Sequence[int], parameters: Sequence[int]
+    ) -> None:
         self._name, self._two = shown_path(path), description.fmiVersion.startswith("2.")
         self._inputs, self._parameters = list(inputs), list(parameters)
         self._indicators = description.numberOfEventIndicators or len(description.eventIndicators)
@@ -55,7 +62,7 @@ class Fmu:
         self._x, self._rate = np.empty(nx), np.empty(nx)
         number = ctypes.POINTER(ctypes.c_double)
         self._x_at, self._rate_at = (array.ctypes.data_as(number) for array in (self._x, self._rate))
-        self._kept: Any = None
+        self._kept: object = None
         self._ready: tuple[bytes, bytes] | None = None
         with self._blamed("cannot be loaded", "export it for this machine"):
             self._fmu = self._load(path, description)
@@ -70,7 +77,7 @@ class Fmu:
             self._initialise()
             self.default_u, self.default_p = self._get(self._inputs), self._get(self._parameters)
 
-    def _load(self, path: Path, description: Any) -> Any:
+    def _load(self, path: Path, description: ModelDescription) -> FMU2Model | FMU3Model:
         import fmpy
         from fmpy.fmi2 import FMU2Model, fmi2CallbackFunctions, fmi2CallbackLoggerTYPE
         from fmpy.fmi2 import defaultCallbacks as defaults
@@ -103,7 +110,7 @@ class Fmu:
         return fmu
 
     @contextmanager
-    def _blamed(self, what: str, remedy: str = "correct its start values") -> Any:
+    def _blamed(self, what: str, remedy: str = "correct its start values") -> Iterator[None]:
         """Name the FMU in errors of its calls."""
         try:
             yield
@@ -156,7 +163,7 @@ class Fmu:
                 return self._rows(X, u, p, n, lambda: self._through_events(dt))
             return _rk4(lambda at: self._rows(at, u, p, n, self._rates), X, dt)
 
-    def measured(self, references: list[int]) -> Any:
+    def measured(self, references: list[int]) -> Callable[[np.ndarray, np.ndarray, np.ndarray], np.ndarray]:
         """Return h(X, u, p) of the variables with these value references: the measurements (N, ny)."""
 
         def h(X: np.ndarray, u: np.ndarray, p: np.ndarray) -> np.ndarray:
@@ -274,7 +281,7 @@ class Fmu:
         return self._present()
 
 
-def _free(fmu: Any, folder: tempfile.TemporaryDirectory) -> None:
+def _free(fmu: FMU2Model | FMU3Model, folder: tempfile.TemporaryDirectory) -> None:
     """Free an instance and its library, and remove its files."""
     with suppress(Exception):  # of FMPy, or of an FMU after a fatal error
         fmu.freeInstance()

@@ -7,7 +7,7 @@ from __future__ import annotations
 
 from hashlib import sha256
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 from weakref import WeakValueDictionary
 
 import numpy as np
@@ -21,6 +21,9 @@ from sources.worker_process import gist
 
 from .instance import Fmu
 from .schema import FmuSection, variable_name
+
+if TYPE_CHECKING:
+    from fmpy.model_description import ModelDescription, ScalarVariable
 
 EXCHANGE = "export it for model exchange"
 
@@ -112,7 +115,7 @@ def _model(path: Path, section: FmuSection, places: Loaded) -> StateSpaceModel:
     )
 
 
-def _check_kind(description: Any, path: Path) -> None:
+def _check_kind(description: ModelDescription, path: Path) -> None:
     """Refuse an FMU that offers no model exchange, of another FMI, or without continuous states."""
     name, kind = shown_path(path), description.modelExchange
     if not description.fmiVersion.startswith(("2.", "3.")):
@@ -137,7 +140,7 @@ def _check_kind(description: Any, path: Path) -> None:
 class _Variables:
     """The real variables of an FMU, and their units."""
 
-    def __init__(self, description: Any, section: FmuSection, places: Loaded) -> None:
+    def __init__(self, description: ModelDescription, section: FmuSection, places: Loaded) -> None:
         self.reals = {
             item.name: item
             for item in description.modelVariables
@@ -145,7 +148,7 @@ class _Variables:
         }
         self._units, self._places = section.units, places
 
-    def of(self, key: Key, name: str) -> Any:
+    def of(self, key: Key, name: str) -> ScalarVariable:
         """Return the variable of a name given at `key`."""
         if name not in self.reals:
             rule = nearest(name, self.reals) if self.reals else "it has none"
@@ -156,7 +159,7 @@ class _Variables:
         """Return the variables that are inputs, or outputs, by their names in a model."""
         return {variable_name(item.name): item.name for item in self.reals.values() if item.causality == causality}
 
-    def unit(self, item: Any) -> str:
+    def unit(self, item: ScalarVariable) -> str:
         """Return the unit of a variable."""
         declared = item.declaredType.unit if item.declaredType is not None else None
         return self._units.get(item.name) or item.unit or declared or "1"

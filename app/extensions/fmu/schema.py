@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import re
-from typing import Annotated, Any
+from typing import Annotated
 
 from pydantic import BeforeValidator, Field
 
@@ -15,7 +15,7 @@ def variable_name(variable: str) -> str:
     return re.sub(r"\W+", "_", variable).strip("_")
 
 
-def as_variables(value: Any) -> Any:
+def as_variables(value: object) -> object:
     """Return a list of variables as {name: variable}."""
     if isinstance(value, list) and all(isinstance(item, str) for item in value):
         return {variable_name(item): item for item in value}

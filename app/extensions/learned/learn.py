@@ -6,7 +6,6 @@ import tempfile
 from collections.abc import Mapping
 from dataclasses import replace
 from pathlib import Path
-from typing import TYPE_CHECKING
 
 from app.cli.options import check_output, names_of, overrides_of
 from app.cli.prepare import attend, prepare
@@ -27,13 +26,11 @@ from estimators.registry import find_estimator
 from estimators.smoothing.smooth import check_smooth
 from estimators.tuning import Tuning
 
+from .arguments import LearnCommand as Arguments
 from .correction import run_net
 from .lesson import Lesson, as_dict, correction_text, noises_of, scores_of, sections
 from .train import NET, Trained, against, on_windows, train
 from .windows import Windows, known_states, windows
-
-if TYPE_CHECKING:
-    from .arguments import LearnCommand as Arguments
 
 MIN_BLOCKS = 3  # least number of blocks, of which one is held out
 STRETCHES = 9  # long parts of each recording over which errors add up to choose between candidates

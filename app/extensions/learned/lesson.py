@@ -4,11 +4,11 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 
-from app.result import Topic
+from app.result import JsonObject, Topic
 from app.study.fit_json import part_json
 from app.twin.twin import Twin
 from app.twin.versions import now
@@ -51,7 +51,7 @@ def sections(name: str, window: float, lesson: Lesson, keep: Path | None) -> lis
     return [_windows(name, window, lesson), _folds(lesson), _verdict(lesson, keep)]
 
 
-def as_dict(lesson: Lesson) -> dict[str, Any]:
+def as_dict(lesson: Lesson) -> JsonObject:
     """Return the result for scripts."""
     held_out = lesson.held_out
     return {
@@ -80,7 +80,7 @@ def scores_of(lesson: Lesson) -> dict[str, float]:
     return {name: value for name, value in found.items() if np.isfinite(value)}
 
 
-def _of_windows(lesson: Lesson, part: OnWindows) -> dict[str, Any]:
+def _of_windows(lesson: Lesson, part: OnWindows) -> JsonObject:
     def both(pair: tuple[np.ndarray, np.ndarray], j: int) -> dict[str, float]:
         return {"physics": float(pair[0][j]), "corrected": float(pair[1][j])}
 

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import Annotated, Any, Literal
+from typing import Annotated, Literal
 
 from pydantic import BeforeValidator, Field, model_validator
 
@@ -38,7 +38,7 @@ class RegisterSection(Section):
         return 1 if self.table in BIT_TABLES else SIZES[self.type]
 
 
-def _register(value: Any) -> Any:
+def _register(value: object) -> object:
     return {"address": value} if isinstance(value, int) else value
 
 

@@ -5,23 +5,24 @@ from __future__ import annotations
 import json
 import threading
 from collections.abc import Callable
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import TYPE_CHECKING, NamedTuple
 
 from app.engine.copies import OutputLink
+from app.engine.notices import Notices
 from app.engine.outputs.alerts import AlertMessage
 from app.engine.outputs.receivers import TIMEOUT_S
 from app.engine.outputs.state_message import StateMessage, iso_now, state_schema
+from app.engine.running_fold import Running
 from app.twin.secrets import Secrets
 from estimators.errors import printable
+from estimators.model.state_space import Input, State, StateSpaceModel
 
 from .client import mqtt_client
+from .schema import MqttSection
 
 if TYPE_CHECKING:
-    from app.engine.notices import Notices
-    from app.engine.running_fold import Running
-    from estimators.model.state_space import StateSpaceModel
-
-    from .schema import MqttSection
+    from paho.mqtt.client import Client
+    from paho.mqtt.reasoncodes import ReasonCode
 
 MAX_UNSENT = 100
 """States that the connection has not taken; with more, a broker that reads too slowly loses some."""
@@ -77,7 +78,7 @@ class MqttOutput:
         self._name, self._model, self._of_assets = name, model, of_assets
         self._root = f"{section.prefix}/{name}"
         password = None if section.password_env is None else secrets[section.password_env]
-        self.client: Any = mqtt_client(section, password, client_id=f"nisus-{name}")
+        self.client = mqtt_client(section, password, client_id=f"nisus-{name}")
         self.client.on_pre_connect = self._connecting
         self.client.on_connect, self.client.on_disconnect = self._connected, self._disconnected
         self.client.on_connect_fail = lambda *_: self._lost("the broker does not answer")
@@ -174,7 +175,7 @@ class MqttOutput:
     def _birth(self) -> Packet:
         """Return the first message of a connection: names and units of all values, and the schema of the messages."""
         model = self._model()
-        parts: dict[str, Any] = {"states": model.shown_states, "inputs": model.inputs}
+        parts: dict[str, tuple[State | Input, ...]] = {"states": model.shown_states, "inputs": model.inputs}
         names = {key: [{"name": item.name, "unit": item.unit} for item in items] for key, items in parts.items()}
         told = {"twin": self._name, "since": iso_now(), **names, "sensors": list(model.sensor_names)}
         body = json.dumps(told | {"schema": state_schema()})
@@ -182,10 +183,10 @@ class MqttOutput:
 
     # On the thread of the client
 
-    def _connecting(self, client: Any, _data: Any) -> None:
+    def _connecting(self, client: Client, _data: object) -> None:
         client.will_set(*self._status(online=False))
 
-    def _connected(self, client: Any, _data: Any, _flags: Any, reason: Any, _properties: Any) -> None:
+    def _connected(self, _client: object, _data: object, _flags: object, reason: ReasonCode, *_: object) -> None:
         if reason.is_failure:
             self._lost(f"the broker refuses: {reason}")
             return
@@ -197,7 +198,7 @@ class MqttOutput:
             self._reported = False
             self._notices.say(f"output mqtt: connected again to {self._place}")
 
-    def _disconnected(self, _client: Any, _data: Any, _flags: Any, reason: Any, _properties: Any) -> None:
+    def _disconnected(self, _client: object, _data: object, _flags: object, reason: object, *_: object) -> None:
         self._lost(f"the connection ended: {reason}")
 
     def _lost(self, text: str) -> None:
@@ -208,7 +209,7 @@ class MqttOutput:
             self._notices.say(f"output mqtt: no broker at {place} ({self._problem}); it is tried again", level="warn")
             self._notices.count("output mqtt")
 
-    def _taken(self, *_: Any) -> None:
+    def _taken(self, *_: object) -> None:
         with self._counting:
             self._unsent = max(0, self._unsent - 1)
 

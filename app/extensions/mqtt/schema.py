@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import Annotated, Any, Literal
+from typing import Annotated, Literal
 
 from pydantic import BeforeValidator, Field
 
@@ -36,7 +36,7 @@ class TopicSection(Section):
     """Path of a sequence number: a message of the same topic and number is taken once. Default: none."""
 
 
-def _topic(value: Any) -> Any:
+def _topic(value: object) -> object:
     return {"values": {value: ""}} if isinstance(value, str) else {} if value is None else value
 
 

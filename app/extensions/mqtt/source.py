@@ -8,13 +8,14 @@ import queue
 import re
 import threading
 import zlib
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from contextlib import suppress
 from decimal import Decimal, InvalidOperation
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from app.result import JsonObject
 from app.twin.secrets import secret
 from app.twin.sources.kind import Opening, failure
 from app.twin.sources.push import messages_of
@@ -25,6 +26,10 @@ from sources.tables.text import no_value
 
 from .client import mqtt_client
 from .schema import ASSET_LEVEL, MqttSourceSection, TopicSection
+
+if TYPE_CHECKING:
+    from paho.mqtt.client import Client, MQTTMessage
+    from paho.mqtt.reasoncodes import ReasonCode
 
 TOPIC_FILTER = re.compile(r"(?:(?:[^#+/\x00]*|\+)/)*(?:[^#+/\x00]*|\+|#)")
 """Topics with wildcards, as brokers take them."""
@@ -58,7 +63,7 @@ class TopicMap(TopicSection):
     asset: int | None = None
     """Level of the topic with the name of the asset, counted from 0. Default: none."""
 
-    def message(self, topic: str, payload: bytes) -> dict[str, Any]:
+    def message(self, topic: str, payload: bytes) -> JsonObject:
         """Return the message of a payload.
 
         Raises:
@@ -79,7 +84,7 @@ class TopicMap(TopicSection):
                 raise ValueError('the payload must be an object such as {"values": {"NAME": 1.2}}')
             return {"source": topic, **body, **asset}
         good = self.quality is None or str(at_path(body, self.quality)) in self.good
-        found: dict[str, Any] = {
+        found: JsonObject = {
             "source": topic,
             "values": {name: at_path(body, path) if good else None for name, path in self.values.items()},
             **asset,
@@ -105,7 +110,7 @@ def at_path(body: Any, path: str) -> Any:
     return body
 
 
-def as_time(value: Any, unit: str) -> Any:
+def as_time(value: object, unit: str) -> object:
     """Return a number of a unit as ns; a text as it is, which must be ISO 8601."""
     if isinstance(value, bool) or not isinstance(value, int | float):
         return value
@@ -126,7 +131,7 @@ class TakenPackets:
     def __init__(self) -> None:
         self._checksums: dict[int, int] = {}
 
-    def add(self, packet: Any) -> bool:
+    def add(self, packet: MQTTMessage) -> bool:
         """Note a packet; return whether it is new."""
         checksum = zlib.crc32(packet.payload, zlib.crc32(packet.topic.encode()))
         if packet.dup and self._checksums.get(packet.mid) == checksum:
@@ -185,7 +190,7 @@ class MqttSource:
         """Set while the topics are subscribed to."""
         self._client.on_subscribe = self._subscribed
         self._requests: dict[int | None, list[str]] = {}
-        self._waiting: queue.SimpleQueue[tuple[TopicMap, Any]] = queue.SimpleQueue()
+        self._waiting: queue.SimpleQueue[tuple[TopicMap, MQTTMessage]] = queue.SimpleQueue()
         self._by_hand, self._packets = by_hand, TakenPackets()
         self._unstored: dict[int, None] = {}
         """Ids of packets that were read, but not acknowledged, in their order."""
@@ -205,7 +210,7 @@ class MqttSource:
             self._client.connect_async(host, port, keepalive=15)
         self._client.loop_start()
 
-    def _connected(self, client: Any, _data: Any, _flags: Any, reason: Any, _properties: Any) -> None:
+    def _connected(self, client: Client, _data: object, _flags: object, reason: ReasonCode, *_: object) -> None:
         if reason.is_failure:
             self._lost(f"it refuses: {reason}")
             return
@@ -214,7 +219,7 @@ class MqttSource:
             names = self._subscribed_to[at : at + MAX_TOPICS]
             self._requests[client.subscribe([(name, self._section.qos) for name in names])[1]] = names
 
-    def _subscribed(self, _client: Any, _data: Any, number: Any, reasons: Any, _properties: Any) -> None:
+    def _subscribed(self, _client: object, _data: object, number: int, reasons: list[ReasonCode], *_: object) -> None:
         for name, reason in zip(self._requests.pop(number, self._subscribed_to), reasons, strict=False):
             if reason.is_failure:
                 text = f"the broker at {self._place} refuses the topic {name} ({reason}); check the rights of the user"
@@ -222,7 +227,7 @@ class MqttSource:
         if not self._requests:
             self.connected.set()
 
-    def _disconnected(self, _client: Any, _data: Any, _flags: Any, reason: Any, _properties: Any) -> None:
+    def _disconnected(self, _client: object, _data: object, _flags: object, reason: object, *_: object) -> None:
         self._lost(f"the connection ended: {reason}")
 
     def _lost(self, why: str) -> None:
@@ -231,8 +236,8 @@ class MqttSource:
             NO_BROKER, f"no measurements from the broker at {self._place}: {printable(why)}; it is tried again"
         )
 
-    def _callback(self, topic: TopicMap) -> Any:
-        def arrived(client: Any, _data: Any, packet: Any) -> None:
+    def _callback(self, topic: TopicMap) -> Callable[[Client, object, MQTTMessage], None]:
+        def arrived(client: Client, _data: object, packet: MQTTMessage) -> None:
             if self._waiting.qsize() < MAX_WAITING:
                 self._waiting.put((topic, packet))
                 return
@@ -244,7 +249,7 @@ class MqttSource:
 
     def read(self, timeout: float) -> Any:
         """Return the events of the next messages."""
-        found: list[tuple[TopicMap, Any]] = []
+        found: list[tuple[TopicMap, MQTTMessage]] = []
         with suppress(queue.Empty):
             found.append(self._waiting.get(timeout=timeout))
             while len(found) < MAX_BATCH:
@@ -257,7 +262,7 @@ class MqttSource:
                 self._refuse(packet, answer.reason)
         return self.messages.read(0.0)
 
-    def _is_new(self, packet: Any) -> bool:
+    def _is_new(self, packet: MQTTMessage) -> bool:
         """Return whether a packet is used; one that was stored before is acknowledged again."""
         if not self._by_hand or not packet.qos:
             return True
@@ -268,7 +273,7 @@ class MqttSource:
             self._client.ack(packet.mid, packet.qos)
         return False
 
-    def _decoded(self, topic: TopicMap, packet: Any) -> dict[str, Any] | None:
+    def _decoded(self, topic: TopicMap, packet: MQTTMessage) -> JsonObject | None:
         """Return the message of a packet; None if it has none."""
         try:
             found = topic.message(packet.topic, packet.payload)
@@ -278,7 +283,7 @@ class MqttSource:
         # The broker sends the last retained message to each new subscriber: without a time it is of no moment.
         return None if packet.retain and found.get("time") is None else found
 
-    def _refuse(self, packet: Any, reason: str) -> None:
+    def _refuse(self, packet: MQTTMessage, reason: str) -> None:
         self._report(REFUSED_MESSAGE, f"{printable(packet.topic)[:100]}: {printable(reason)}; it is not used")
 
     @property
@@ -286,7 +291,7 @@ class MqttSource:
         """Messages that were accepted and read."""
         return self.messages.mark
 
-    def numbers(self, mark: int) -> dict[str, Any]:
+    def numbers(self, mark: int) -> JsonObject:
         """See `Marked`."""
         numbers = self.messages.numbers(mark)
         return {"senders": numbers, "packets": self._packets.state()} if self._by_hand else numbers

@@ -12,15 +12,16 @@ from typing import TYPE_CHECKING, Any
 
 from app.engine.copies import OutputLink
 from app.engine.outputs.state_message import StateMessage
+from app.engine.running_fold import Running
 from app.twin.secrets import Secrets
 from estimators.errors import ConfigError
 
+from .schema import OpcUaSection
 from .source import run_again
 
 if TYPE_CHECKING:
-    from app.engine.running_fold import Running
-
-    from .schema import OpcUaSection
+    from asyncua import Node, Server
+    from asyncua.server.user_managers import UserManager
 
 NAMESPACE = "urn:nisus"
 
@@ -128,7 +129,7 @@ class OpcUaOutput:
                     for name, value in values_of(self._message).items():
                         await server.write_attribute_value(nodes[name].nodeid, value)
 
-    def _users(self) -> Any:
+    def _users(self) -> UserManager:
         """Return the manager of users: none may write, and with a password only its user may read."""
         from asyncua.crypto.permission_rules import User, UserRole
         from asyncua.server.user_managers import UserManager
@@ -147,15 +148,15 @@ class OpcUaOutput:
 
         return Readers()
 
-    async def _nodes(self, server: Any, index: int) -> dict[str, Any]:
+    async def _nodes(self, server: Server, index: int) -> dict[str, Node]:
         """Add the variables of the twin; return them by name."""
         from asyncua import ua
 
         name, model = self._engine.twin.name, self._engine.model
         folder = await server.nodes.objects.add_folder(ua.NodeId(name, index), ua.QualifiedName(name, index))
-        found: dict[str, Any] = {}
+        found: dict[str, Node] = {}
 
-        async def add(parent: Any, path: str, label: str, kind: Any, start: Any) -> Any:
+        async def add(parent: Node, path: str, label: str, kind: ua.VariantType, start: object) -> Node:
             node_id, text = ua.NodeId(f"{name}.{path}", index), ua.QualifiedName(label, index)
             value = ua.DataValue(ua.Variant(start, kind), ua.StatusCode(ua.StatusCodes.BadWaitingForInitialData))
             found[path] = await parent.add_variable(node_id, text, ua.Variant(start, kind))
@@ -173,19 +174,19 @@ class OpcUaOutput:
         return found
 
 
-def values_of(message: StateMessage) -> dict[str, Any]:
+def values_of(message: StateMessage) -> dict[str, object]:
     """Return a value (asyncua's DataValue) for each variable."""
     from asyncua import ua
 
     ns = message.time_ns if message.time is not None else None
     stamp = None if ns is None else EPOCH + timedelta(microseconds=ns // 1000)
 
-    def data(value: Any, kind: Any, code: str) -> Any:
+    def data(value: object, kind: ua.VariantType, code: str) -> ua.DataValue:
         # A value of bad status is to be ignored: there is none.
         variant = ua.Variant(value, kind) if value is not None else ua.Variant(None, ua.VariantType.Null)
         return ua.DataValue(variant, ua.StatusCode(getattr(ua.StatusCodes, code)), SourceTimestamp=stamp)
 
-    found: dict[str, Any] = {}
+    found: dict[str, object] = {}
     for state in message.states:
         code = STATUS_CODES[state.grade]
         for path, value in (

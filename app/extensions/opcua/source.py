@@ -50,7 +50,7 @@ class OpcUaSource:
                 text = f"source: node {quoted(node)} of {name} is no node id; it must be like ns=2;s=Tank.Level"
                 raise ConfigError(text) from None
         self._report = report
-        self._last: dict[str, tuple[Any, Any]] = {}
+        self._last: dict[str, tuple[object, object]] = {}
         self.connected = threading.Event()
         """Set while the nodes are subscribed to."""
         self._loop = asyncio.new_event_loop()
@@ -86,7 +86,7 @@ class OpcUaSource:
         if stamp is not None and self._last.get(name) == (stamp, number):
             return
         self._last[name] = stamp, number
-        message: dict[str, Any] = {"source": self._url, "values": {name: number}}
+        message: dict[str, object] = {"source": self._url, "values": {name: number}}
         if stamp is not None:
             message["time"] = f"{stamp.replace(tzinfo=None).isoformat()}Z"
         answer = self._messages.send([message])[0]
@@ -137,7 +137,7 @@ class NodeHandler:
         self._source = source
         self._names = dict(names)
 
-    def datachange_notification(self, node: Any, _value: Any, data: Any) -> None:
+    def datachange_notification(self, node: Any, _value: object, data: Any) -> None:
         """Take a changed value."""
         self._source.changed(self._names[node.nodeid.to_string()], data.monitored_item.Value)
 

@@ -30,6 +30,7 @@ from .track import TrackSeries, draw_state, hex_color, new_figure
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
+    from matplotlib.figure import Figure
 
 WIDTH, HEIGHT, MARGIN = 320, 140, 8
 """Size of the picture, in points."""
@@ -217,7 +218,7 @@ def _draw_image(axes: Axes, values: np.ndarray, kind: PictureKind, extent: tuple
     axes.set_xlim(0.0, max(extent[1], axes.get_xlim()[1]))
 
 
-def _themed_svg(figure: Any) -> str:
+def _themed_svg(figure: Figure) -> str:
     """Return a figure as an SVG for the page: colours by name, nothing that is fetched."""
     import matplotlib
 

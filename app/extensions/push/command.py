@@ -11,15 +11,14 @@ import threading
 import time
 import uuid
 from collections import Counter
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterable, Iterator
 from contextlib import suppress
 from decimal import Decimal, InvalidOperation
-from typing import Any
 from urllib.error import HTTPError, URLError
 from urllib.parse import parse_qs, urlsplit
 from urllib.request import ProxyHandler, Request, build_opener
 
-from app.result import to_json
+from app.result import JsonObject, to_json
 from app.terminal import complain
 from estimators.errors import ConfigError, nearest, quoted, shown_name
 
@@ -58,7 +57,7 @@ def push(arguments: Arguments) -> int:
 class RowReader:
     """Lines of a stream as messages: NDJSON, or CSV whose first line has the names of its columns."""
 
-    def __init__(self, stream: Any, names: set[str], time_column: str | None, ns: int, source: str) -> None:
+    def __init__(self, stream: Iterable[str], names: set[str], time_column: str | None, ns: int, source: str) -> None:
         self._stream, self._names, self._ns, self._source = stream, names, ns, source
         self._time, self._timed = time_column or "time", time_column is not None
         self._columns: list[str] | None = None
@@ -70,7 +69,7 @@ class RowReader:
             self._waiting.put(line)
         self._waiting.put(None)
 
-    def batches(self) -> Iterator[tuple[list[int], list[Any]]]:
+    def batches(self) -> Iterator[tuple[list[int], list[object]]]:
         """Yield the lines that have come, as their numbers and messages."""
         ended = False
         while not ended:
@@ -92,7 +91,7 @@ class RowReader:
             for _ in range(MAX_BATCH_LINES - 1):
                 yield self._waiting.get(timeout=max(0.0, end - time.monotonic()))
 
-    def _message(self, number: int, line: str) -> Any:
+    def _message(self, number: int, line: str) -> object:
         """Return the message of a line; None if it is empty, or names the columns."""
         if number == 1:
             line = line.removeprefix("\ufeff")
@@ -154,7 +153,7 @@ class TwinClient:
         self._headers = {"Authorization": f"Bearer {token}", "Content-Type": "application/json"}
         self._opener = build_opener(ProxyHandler({}))
 
-    def request(self, messages: list[Any] | None = None) -> Mapping[str, Any]:
+    def request(self, messages: list[object] | None = None) -> JsonObject:
         """Return the answer to messages, or to the question for names; wait while the twin is not there.
 
         Raises:
@@ -164,7 +163,7 @@ class TwinClient:
         while True:
             try:
                 with self._opener.open(Request(self._url, body, self._headers), timeout=TIMEOUT_S) as found:
-                    answer: Mapping[str, Any] = json.load(found)
+                    answer: JsonObject = json.load(found)
                     return answer
             except HTTPError as error:
                 text = error.read().decode(errors="replace").strip()

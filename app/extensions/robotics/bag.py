@@ -12,7 +12,7 @@ from __future__ import annotations
 from collections.abc import Callable, Collection, Generator, Iterator, Sequence
 from contextlib import contextmanager, suppress
 from pathlib import Path
-from typing import Any
+from typing import IO, Any
 
 import numpy as np
 
@@ -80,7 +80,7 @@ def bag_names(path: Path, time: str = "") -> list[str]:
     return found
 
 
-def _first(topics: dict[str, BagTopic], wanted: set[str], messages: Messages) -> Iterator[tuple[str, Any]]:
+def _first(topics: dict[str, BagTopic], wanted: set[str], messages: Messages) -> Iterator[tuple[str, object]]:
     """Yield topic and message of the first messages of some topics, as far as they can be read."""
     left = dict.fromkeys(wanted, MAX_SCANNED)
     with suppress(Exception):  # Reading it reports where it is damaged.
@@ -211,7 +211,7 @@ def _bag(path: Path) -> Iterator[tuple[dict[str, Declared], Messages]]:
         reader.close()
 
 
-def _indexed(file: Any) -> tuple[dict[str, Declared], Messages] | None:
+def _indexed(file: IO[bytes]) -> tuple[dict[str, Declared], Messages] | None:
     """Return topics and messages of an MCAP by its index; None without one."""
     from mcap.reader import SeekingReader
 

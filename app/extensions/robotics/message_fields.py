@@ -30,7 +30,7 @@ HEADER = "std_msgs/msg/Header"
 
 NO_VALUES = (HEADER, "std_msgs/msg/MultiArrayLayout")  # Types whose numbers are not data
 
-Test = Callable[[Any], bool]
+Test = Callable[[object], bool]
 
 
 class MessageField(NamedTuple):
@@ -40,12 +40,12 @@ class MessageField(NamedTuple):
     is missing if one of `invalid` holds of the message.
     """
 
-    get: Callable[[Any], Any]
+    get: Callable[[object], Any]
     invalid: tuple[Test, ...] = ()
     array: bool = False
-    names: Callable[[Any], Sequence[str]] | None = None
+    names: Callable[[object], Sequence[str]] | None = None
 
-    def elements(self, message: Any) -> Sequence[str]:
+    def elements(self, message: object) -> Sequence[str]:
         """Return the names or numbers of the elements of an array in this message; none if it is too long."""
         count = len(self.get(message))
         names = self.names(message) if self.names is not None else ()
@@ -53,7 +53,7 @@ class MessageField(NamedTuple):
             return ()
         return names if len(names) == count else [str(k) for k in range(count)]
 
-    def value(self, message: Any, element: str) -> float | None:
+    def value(self, message: object, element: str) -> float | None:
         """Return the value, NaN if it is invalid, None if this message does not have the element."""
         found = self.get(message)
         if self.array:
@@ -68,7 +68,7 @@ class BagTopic(NamedTuple):
     """Topic of a bag: the type of its messages, their decoder, their fields, and whether they have a header."""
 
     type: str
-    decode: Callable[[bytes], Any]
+    decode: Callable[[bytes], object]
     fields: dict[str, MessageField]
     stamped: bool
 
@@ -124,8 +124,8 @@ def _types(one: Declared) -> Any:
     return {name: kind for part in parts for name, kind in get_types_from_idl(part).items()}
 
 
-def _decoder(store: Any, kind: str) -> Callable[[bytes], Any]:
-    def decode(data: bytes) -> Any:
+def _decoder(store: Any, kind: str) -> Callable[[bytes], object]:
+    def decode(data: bytes) -> object:
         if data[:4] == ZSTD:
             import pyarrow  # Here, not above: it takes long, and most messages are not compressed.
 
@@ -178,12 +178,12 @@ def _fields(types: Any, kind: str, prefix: str = "", invalid: tuple[Test, ...] =
     return found
 
 
-def _part(path: str, of: Callable[[Any, Any], Any], key: Any) -> Callable[[Any], Any]:
+def _part(path: str, of: Callable[[Any, Any], float], key: str | int) -> Callable[[object], float]:
     get = attrgetter(path)
     return lambda message: of(get(message), key)
 
 
-def _test(path: str, rule: Test) -> Test:
+def _test(path: str, rule: Callable[[Any], bool]) -> Test:
     get = attrgetter(path)
     return lambda message: rule(get(message))
 

@@ -14,29 +14,29 @@ from contextlib import suppress
 from functools import partial
 from multiprocessing.connection import Connection
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import TYPE_CHECKING, NamedTuple
 from urllib.parse import quote
 
 from app.record.rrd_file import NEVER, Split, parse_split
+from app.result import JsonObject
 from app.terminal import until_asked_to_end, use_lines_of_json, when_asked_to_end
 from app.web.access import NEEDS_TOKENS, Grant, grants_of
 from app.web.http_server import LOOPBACK, HttpServer, check_port
 from config.loader import shipped
 from estimators.errors import ConfigError, NisusError, is_blank, quoted
 
+from .arguments import ServeCommand, ServiceOptions
 from .service import BLANK, Service, TwinFolder
 from .supervisor import STATUS_PERIOD_S, Supervisor, forget_safe_path
 
 if TYPE_CHECKING:
     from app.web.session import Session
 
-    from .arguments import ServeCommand, ServiceOptions
-
 PRELOADED = (f"{__package__}.preloaded",)
 """Modules that the processes of the twins share: they are imported once."""
 
 
-OpenTwin = Callable[[str, str], "tuple[Session, Mapping[str, Any]]"]
+OpenTwin = Callable[[str, str], "tuple[Session, Mapping[str, object]]"]
 """Opens a twin, given its name and path; returns its session and its card in the overview."""
 
 MEMORY_PERIOD_S = 10.0
@@ -186,7 +186,7 @@ def _take(pipe: Connection, session: Session, done: threading.Event) -> None:
         session.engine.audit.add(*content)
 
 
-def _opened(options: TwinPlaces, name: str, path: str) -> tuple[Session, Mapping[str, Any]]:
+def _opened(options: TwinPlaces, name: str, path: str) -> tuple[Session, Mapping[str, object]]:
     from dataclasses import asdict
 
     from app.cli.open_twin import FileOpener, open_session, opened_twin
@@ -206,7 +206,7 @@ def _opened(options: TwinPlaces, name: str, path: str) -> tuple[Session, Mapping
     return session, asdict(card_of(path, opening.twin))
 
 
-def report_of(session: Session) -> dict[str, Any]:
+def report_of(session: Session) -> JsonObject:
     """Return what the overview shows of a twin."""
     from estimators.track import HEALTH_NAMES
 

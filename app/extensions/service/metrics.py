@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import numpy as np
 from starlette.responses import Response
@@ -17,6 +17,7 @@ from estimators.track import HEALTH_NAMES, VERDICT_NAMES
 
 if TYPE_CHECKING:
     from prometheus_client.core import Metric
+    from prometheus_client.registry import Collector
 
 
 class TwinCollector:
@@ -113,13 +114,13 @@ def metrics_route(engine: Engine) -> BaseRoute:
     return get("/metrics", metrics)
 
 
-def exposed(collector: Any) -> Response:
+def exposed(collector: Collector) -> Response:
     """Answer with metrics, also of this process, in Prometheus's text format; 501 without its package."""
     try:
         from prometheus_client import CONTENT_TYPE_LATEST, CollectorRegistry, ProcessCollector, generate_latest
     except ModuleNotFoundError:
         return refusal(ConfigError("metrics need prometheus-client: pip install 'nisus[service]'"), 501)
-    registry: Any = CollectorRegistry()
+    registry = CollectorRegistry()
     registry.register(collector)
     ProcessCollector(registry=registry)
     return Response(generate_latest(registry), media_type=CONTENT_TYPE_LATEST)

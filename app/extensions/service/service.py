@@ -10,7 +10,7 @@ import asyncio
 import time
 from collections.abc import Mapping
 from pathlib import Path
-from typing import Any, Protocol
+from typing import Protocol
 from urllib.parse import quote
 
 from starlette.applications import Starlette
@@ -20,6 +20,7 @@ from starlette.routing import BaseRoute, Mount, Route, WebSocketRoute
 from starlette.staticfiles import StaticFiles
 from starlette.websockets import WebSocket
 
+from app.result import JsonObject
 from app.terminal import print_line
 from app.web.access import USER, User
 from app.web.http import PAGE, get, page_file, post, refusal
@@ -100,7 +101,7 @@ class Service:
     def revision(self) -> None:
         """A service has twins, of which each has its revisions."""
 
-    def add(self, user: User, path: str, body: Mapping[str, Any], revision: int | None = None) -> None:
+    def add(self, user: User, path: str, body: Mapping[str, object], revision: int | None = None) -> None:
         """Pass a request that starts or stops a twin on to the audit log of that."""
         twin = self.twins.get(str(body.get("twin", "")))
         if twin is not None and path.startswith("/api/gallery/"):
@@ -133,13 +134,13 @@ class Service:
             return self._overview.page(self.http_server.boot)
         return page_file("gallery.html", {"boot": self.http_server.boot, "service": True}, title="Overview")
 
-    def state(self) -> dict[str, Any]:
+    def state(self) -> JsonObject:
         """Return the state of each twin, the worst first."""
         twins = sorted(self.twins.values(), key=lambda twin: twin.rank)
         idle = {"running": None, "starting": None, "failed": None}
         return {"boot": self.http_server.boot, **idle, "twins": [twin.json() for twin in twins]}
 
-    def _cards(self) -> list[dict[str, Any]]:
+    def _cards(self) -> list[JsonObject]:
         """Return a card for each twin."""
         unknown = {"question": None, "teaches": None, "source": "", "states": 0, "rows": 0, "estimator": ""}
         unknown |= {"log": False, "picture": False, "missing": None, "error": None}
@@ -156,7 +157,7 @@ class Service:
         missing = [twin.name for twin in self.twins.values() if twin.wanted and twin.state != RUNNING]
         return f"{len(missing)} twin(s) do not run: {', '.join(missing[:20])}" if missing else ""
 
-    def _start(self, twin: str) -> Any:
+    def _start(self, twin: str) -> JsonObject:
         """Begin to start a stopped twin."""
         found = self.find(twin)
         with self._supervisor.changing:
@@ -165,7 +166,7 @@ class Service:
                 found.state, found.due, found.wait = STARTING, 0.0, FIRST_RETRY_S
         return self.state()
 
-    def _stop(self, twin: str) -> Any:
+    def _stop(self, twin: str) -> JsonObject:
         """Begin to stop a twin; the others go on."""
         found = self.find(twin)
         with self._supervisor.changing:
@@ -175,7 +176,7 @@ class Service:
             self._supervisor.ask_to_stop(found)
         return self.state()
 
-    def _restart(self, twin: str) -> Any:
+    def _restart(self, twin: str) -> JsonObject:
         """Begin to stop a twin and to start it anew, with its file as it is now."""
         found = self.find(twin)
         with self._supervisor.changing:

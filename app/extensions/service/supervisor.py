@@ -15,6 +15,7 @@ from multiprocessing.connection import Connection, wait
 from typing import Any
 
 from app.engine.jobs import LoopThread
+from app.result import JsonObject
 from app.terminal import print_line
 from estimators.track import HEALTH_NAMES
 
@@ -66,9 +67,9 @@ class ServedTwin:
     due: float = 0.0
     wait: float = FIRST_RETRY_S
     starts: int = 0
-    card: Mapping[str, Any] = field(default_factory=dict)
-    report: Mapping[str, Any] = field(default_factory=dict)
-    noted: list[tuple[Any, ...]] = field(default_factory=list)
+    card: Mapping[str, object] = field(default_factory=dict)
+    report: Mapping[str, object] = field(default_factory=dict)
+    noted: list[tuple[object, ...]] = field(default_factory=list)
 
     @property
     def rank(self) -> tuple[int, str]:
@@ -81,7 +82,7 @@ class ServedTwin:
         order = ("diverged", "stale", "degraded", "suspect", "advisory", "waiting", "tracking")
         return order.index(health) - 1 if health in order else 0, self.name
 
-    def json(self) -> dict[str, Any]:
+    def json(self) -> JsonObject:
         """Return its state for the overview."""
         now = time.monotonic()
         return {
@@ -175,7 +176,7 @@ class Supervisor:
         for twin in self.twins.values():
             self._end(twin, end)
 
-    def note(self, twin: ServedTwin, entry: tuple[Any, ...]) -> None:
+    def note(self, twin: ServedTwin, entry: tuple[object, ...]) -> None:
         """Pass a request on to the audit log of a twin."""
         with self.changing:
             twin.noted.append(entry)
@@ -200,7 +201,7 @@ class Supervisor:
             with self.changing:
                 self._look()
 
-    def _rest(self) -> set[Any]:
+    def _rest(self) -> set[Connection]:
         self._thread.stopping.wait(0.2)
         return set()
 

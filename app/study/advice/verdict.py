@@ -15,7 +15,6 @@ from __future__ import annotations
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import dataclass, field
-from typing import Any
 
 from config.tunings import SPREADS
 from config.yaml_files import as_flow, as_section, parse, with_section, with_values
@@ -25,7 +24,7 @@ from estimators.log import Log
 from estimators.registry import find_entry, unfit
 
 from ...format_time import counted, format_time
-from ...result import plain
+from ...result import JsonObject, plain
 from ...twin.twin import Twin
 from .coloured_noise import COLOURED, lasting
 from .measured import NO, UNTOLD, YES, Claim, Exclusion, Measured, digits, repeat_lines, repeats_of
@@ -262,7 +261,7 @@ def _of_tails(told: Advice, measured: Measured) -> None:
             told.estimator, told.options, told.because = name, weighted, (*told.because, "tails")
 
 
-def advice_json(twin: Twin, log: Log, told: Advice) -> dict[str, Any]:
+def advice_json(twin: Twin, log: Log, told: Advice) -> JsonObject:
     """`estimator`, `options`, `because`, `claims` with figure and threshold, `lines`, `remedies`."""
     return {
         "twin": twin.name,
@@ -306,7 +305,7 @@ def lasting_lines(advice: Advice) -> str:
     return "".join(f"{line}\n" for group, entries in found.items() for line in as_section(group, entries))
 
 
-def with_entry(text: str, key: str, entry: Mapping[str, Any]) -> str:
+def with_entry(text: str, key: str, entry: Mapping[str, object]) -> str:
     """A YAML's text in which `GROUP.NAME` says this too; what else it said stays, its comments do not.
 
     Raises:
@@ -325,7 +324,7 @@ def with_entry(text: str, key: str, entry: Mapping[str, Any]) -> str:
     return changed
 
 
-def changed(text: str, section: str, entries: Mapping[str, Mapping[str, Any]] | None = None) -> str:
+def changed(text: str, section: str, entries: Mapping[str, Mapping[str, object]] | None = None) -> str:
     """Return a YAML text with the section `estimator` replaced or added, and with other entries."""
     text = with_section(text, "estimator", section)
     for key, entry in (entries or {}).items():

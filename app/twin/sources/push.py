@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterable
 from dataclasses import replace
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 from config.channels import ColumnSection, MessagesSection
 from config.yaml_files import Key
@@ -15,6 +15,7 @@ from sources.pieces import VALUES
 from .kind import Kind, Opening, blamed, failure
 
 if TYPE_CHECKING:
+    from config.fields import Section
     from sources.messages import Messages
     from sources.source import Source
 
@@ -51,7 +52,7 @@ def with_channels(section: MessagesSection, model: StateSpaceModel) -> MessagesS
     return section.model_copy(update={"sensors": sensors, "inputs": inputs})
 
 
-def _sections(section: MessagesSection, key: Key) -> dict[Key, Any]:
+def _sections(section: MessagesSection, key: Key) -> dict[Key, Section]:
     return {key: section} if section.sensors or section.inputs or section.truth else {}
 
 

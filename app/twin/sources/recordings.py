@@ -5,7 +5,7 @@ from __future__ import annotations
 import fnmatch
 from dataclasses import replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import numpy as np
 
@@ -24,6 +24,7 @@ from .can import CAN_LOG
 from .kind import Kind, Opening, blamed, closed, find_recording, matching
 
 if TYPE_CHECKING:
+    from config.fields import Section
     from sources.source import Channel, Source
     from sources.tables.times import TimeColumn
 
@@ -108,7 +109,7 @@ def _shares(opening: Opening) -> list[list[Path] | None]:
     return shares
 
 
-def _sections(section: MergedSection, key: Key) -> dict[Key, Any]:
+def _sections(section: MergedSection, key: Key) -> dict[Key, Section]:
     return {(*key, "parts", k): part for k, part in enumerate(section.parts)}
 
 

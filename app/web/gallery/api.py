@@ -5,7 +5,6 @@ from __future__ import annotations
 import time
 from dataclasses import asdict
 from pathlib import Path
-from typing import Any
 
 from starlette.applications import Starlette
 from starlette.requests import Request
@@ -16,6 +15,7 @@ from starlette.staticfiles import StaticFiles
 from config.loader import find
 from estimators.errors import ConfigError, NisusError, quoted
 
+from ...result import JsonObject
 from ..http import PAGE, Json, TooLarge, bounded_body, get, one_line, page_file, post, refusal
 from ..request_threads import in_thread
 from .cards import picture_file, shelf
@@ -69,7 +69,7 @@ class GalleryApi:
         """Answer with the gallery where a twin's page will be."""
         return page_file("gallery.html", {"boot": self._http_server.boot_without_twin}, title="Gallery")
 
-    def state(self) -> dict[str, Any]:
+    def state(self) -> JsonObject:
         """Return the running twin, the start under way, and the last start that failed."""
         gallery, running = self._gallery, self._gallery.session.running
         starting, failed, request = gallery.starting, gallery.failed, gallery.running
@@ -93,16 +93,16 @@ class GalleryApi:
             "failed": failed and {"title": failed[0].name, "text": self._recordings.shortened(one_line(failed[1]))},
         }
 
-    def _cards(self) -> Any:
+    def _cards(self) -> list[JsonObject]:
         """Return a card for each twin."""
         return [asdict(card) for card in shelf(self._gallery.own)]
 
-    def _start(self, twin: str) -> Any:
+    def _start(self, twin: str) -> JsonObject:
         """Begin to start a twin."""
         self._gallery.start(StartRequest(twin))
         return self.state()
 
-    def _stop(self) -> Any:
+    def _stop(self) -> JsonObject:
         """Stop the running twin."""
         self._gallery.stop()
         return self.state()
@@ -118,12 +118,12 @@ class GalleryApi:
 
     # Recordings
 
-    def _list(self) -> Any:
+    def _list(self) -> JsonObject:
         """List the recordings and logs."""
         files = self._recordings.entries(self._is_writing)
         return {"folder": str(self._recordings.folder), "piece": PIECE_BYTES, "files": files}
 
-    def _open(self, name: str, twin: str | None = None) -> Any:
+    def _open(self, name: str, twin: str | None = None) -> JsonObject:
         """Review a recording, or run a twin on a log."""
         path = self._idle(name)
         if path.suffix.lower() == DATABASE:
@@ -136,7 +136,7 @@ class GalleryApi:
             raise ConfigError(f"{path.name} is a log; name the twin that is to read it")
         return {"opening": path.name}
 
-    def _delete(self, name: str) -> Any:
+    def _delete(self, name: str) -> JsonObject:
         """Delete a recording or log."""
         path = self._idle(name)
         self._recordings.delete(name)

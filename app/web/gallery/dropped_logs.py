@@ -16,6 +16,7 @@ from sources.tables.times import SERIAL_DAYS, UNITS, TimeColumn
 from sources.worker_process import IsolatedReader
 
 from ...engine.jobs import CANCELLED, CANCELLING, DONE, FAILED, RUNNING, Job
+from ...result import JsonObject
 from ...study.advice.draft import check_new
 from ...study.advice.draft_fit import DraftStep
 from ...study.log_overview import LogOverview, draft, overview
@@ -75,9 +76,9 @@ class ReaderJob(Job):
 
     def __init__(
         self,
-        function: Callable[..., Iterator[Any]],
+        function: Callable[..., Iterator[object]],
         path: Path,
-        *args: Any,
+        *args: object,
         then: Callable[[Any], None] = lambda item: None,
     ) -> None:
         """Begin `function(path, *args)`, a generator function, importable by name.
@@ -86,7 +87,7 @@ class ReaderJob(Job):
         """
         super().__init__(path.name, lambda job: self._read(function, path, args))
         self.item: Any = None
-        self.answer: tuple[Any, dict[str, Any]] = (None, {})
+        self.answer: tuple[object, JsonObject] = (None, {})
         """The answer of an item, and that item."""
         self._then = then
         threading.Thread(target=self.run, name="log", daemon=True).start()
@@ -103,7 +104,7 @@ class ReaderJob(Job):
             return None
         return self.reason if self.name in self.reason else f"{self.name}: {self.reason}"
 
-    def _read(self, function: Callable[..., Iterator[Any]], path: Path, args: tuple[Any, ...]) -> None:
+    def _read(self, function: Callable[..., Iterator[object]], path: Path, args: tuple[object, ...]) -> None:
         try:
             with closing(IsolatedReader(function, path, *args, timeout=JOB_TIMEOUT_S, keep=False)) as reader:
                 while not reader.ended:
@@ -124,7 +125,7 @@ class DroppedLogs:
         self._recordings, self._names, self._run = recordings, names, run
         self._draft: tuple[str, ReaderJob] | None = None
         self._lock = threading.Lock()
-        self._jobs: dict[Any, ReaderJob] = {}
+        self._jobs: dict[tuple[object, ...], ReaderJob] = {}
 
     def read(self, wanted: LogRequest) -> tuple[Path, ReaderJob]:
         """Return the file and the job that reads it, which begins unless it is there; another one ends.
@@ -151,7 +152,7 @@ class DroppedLogs:
                 self._jobs[key] = ReaderJob(overview, path, *args)
             return path, self._jobs[key]
 
-    def state(self, wanted: LogRequest) -> dict[str, Any]:
+    def state(self, wanted: LogRequest) -> JsonObject:
         """Return how far the log has been read, its signals, and the twins by how well they fit."""
         path, job = self.read(wanted)
         running = not job.over  # asked before its item, which is the last one once it has ended
@@ -165,7 +166,7 @@ class DroppedLogs:
         unproposed = None if job.error is None else self._words(job.error)
         return {**job.answer[1], "proposing": running, "unproposed": unproposed}
 
-    def _answer(self, path: Path, found: LogOverview) -> dict[str, Any]:
+    def _answer(self, path: Path, found: LogOverview) -> JsonObject:
         answer = found.as_json()
         owners = self.databases()
         answer["databases"] = [
@@ -186,7 +187,7 @@ class DroppedLogs:
         answer["twins"] = [] if found.needs == "time" else self.twins(header)
         return {"name": path.name, "state": "ready", "draft_name": self._free_name(path), **answer}
 
-    def draft(self, wanted: DraftRequest) -> dict[str, Any]:
+    def draft(self, wanted: DraftRequest) -> JsonObject:
         """Begin to draft a twin from a log, which then runs; return the progress.
 
         Raises:
@@ -215,7 +216,7 @@ class DroppedLogs:
         self._draft = wanted.twin, ReaderJob(draft, path, *args, then=lambda step: self._run(step.file))
         return self.drafting()
 
-    def drafting(self) -> dict[str, Any]:
+    def drafting(self) -> JsonObject:
         """Return the progress of the draft."""
         if self._draft is None:
             return {"state": "none"}
@@ -226,7 +227,7 @@ class DroppedLogs:
         known = {"doing": step.doing, "summary": step.summary}
         return {"state": state, "twin": twin, "seconds": job.seconds, "error": error, **known}
 
-    def stop_draft(self) -> dict[str, Any]:
+    def stop_draft(self) -> JsonObject:
         """Stop the draft under way; return the progress."""
         if self._draft is not None:
             self._draft[1].cancel()
@@ -287,14 +288,14 @@ class DroppedLogs:
                 return path
         raise ConfigError(f"{name}: there is no such DBC; drop it on the page")
 
-    def twins(self, header: LogHeader) -> list[dict[str, Any]]:
+    def twins(self, header: LogHeader) -> list[JsonObject]:
         """Return all twins, those first that fit a log best, with their matched and missing channels."""
         found = [(match_log(loaded, model, header), card) for card, loaded, model in readable_twins(self._names())]
         found.sort(key=lambda item: (not item[0].runs, -item[0].share, len(item[0].missing), item[1].name))
         return [_twin_json(match, card) for match, card in found]
 
 
-def _twin_json(match: TwinMatch, card: Card) -> dict[str, Any]:
+def _twin_json(match: TwinMatch, card: Card) -> JsonObject:
     lines = {key: list(getattr(match, key)) for key in ("found", "missing")}
     own = {"name": card.name, "short": Path(card.name).stem, "title": card.title}
     return {**own, "runs": match.runs, "share": match.share, "blocking": match.blocking, **lines}

@@ -10,12 +10,13 @@ import threading
 from collections.abc import Callable, Sequence
 from dataclasses import asdict
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 from estimators.errors import ConfigError, NisusError, quoted
 from sources.formats import CAN_LOGS, is_recording, tables
 
 from ...record.rrd_file import Disk
+from ...result import JsonObject
 
 if TYPE_CHECKING:
     from ...record.reader import Facts
@@ -34,7 +35,7 @@ MAX_SUMMARISED_BYTES = 256 * 2**20
 MAX_NAME_BYTES = 200
 """Longest file name, so that a number and the suffix of a part still fit."""
 
-NO_FACTS: dict[str, Any] = {"twin": None, "estimator": None, "seconds": None, "summary": {}}
+NO_FACTS: JsonObject = {"twin": None, "estimator": None, "seconds": None, "summary": {}}
 
 
 class Recordings:
@@ -49,7 +50,7 @@ class Recordings:
         self._lock = threading.Lock()
         self._looking = False
 
-    def entries(self, busy: Callable[[Path], bool] = lambda path: False) -> list[dict[str, Any]]:
+    def entries(self, busy: Callable[[Path], bool] = lambda path: False) -> list[JsonObject]:
         """Return the files, newest first: facts of a recording, or an `error`; `folder` is set outside this one.
 
         Facts are read in a thread, for the next call; `looking` is true while they are missing.
@@ -57,7 +58,7 @@ class Recordings:
         Args:
             busy: Whether a file is being written.
         """
-        found: list[dict[str, Any]] = []
+        found: list[JsonObject] = []
         unknown: list[tuple[Path, tuple[str, int, int]]] = []
         inside = sorted(self.folder.iterdir()) if self.folder.is_dir() else []
         for path in [*inside, *self._elsewhere().values()]:
@@ -118,7 +119,7 @@ class Recordings:
         found = {path.name: path.absolute() for path in self._recorded() if path.absolute().parent != home}
         return {name: path for name, path in found.items() if not (self.folder / name).exists()}
 
-    def find(self, name: Any) -> Path:
+    def find(self, name: str) -> Path:
         """Return the file of that name.
 
         Raises:
@@ -136,7 +137,7 @@ class Recordings:
             text = text.replace(f"{folder}{os.sep}", "")
         return text
 
-    def delete(self, name: Any) -> None:
+    def delete(self, name: str) -> None:
         """Remove a file for good.
 
         Raises:
@@ -148,7 +149,7 @@ class Recordings:
         except OSError as error:
             raise ConfigError(f"{path.name}: {error.strerror}; it cannot be deleted") from None
 
-    def receive(self, name: Any, offset: int, data: bytes, *, last: bool) -> str | None:
+    def receive(self, name: object, offset: int, data: bytes, *, last: bool) -> str | None:
         """Append a piece of a file that a browser sends; the first piece starts the file.
 
         Returns:
@@ -161,7 +162,7 @@ class Recordings:
         if Path(checked).suffix.lower() not in (RECORDING, DATABASE) and not is_recording(checked):
             logs = ", ".join(dict.fromkeys((*CAN_LOGS, *tables())))
             raise ConfigError(
-                f"{quoted(name)}: is neither a recording (.rrd), a log ({logs}, or .csv.gz) nor a "
+                f"{quoted(checked)}: is neither a recording (.rrd), a log ({logs}, or .csv.gz) nor a "
                 "database (.dbc); export it as one of these"
             )
         part = self.folder / f".{checked}{PART}"
@@ -196,7 +197,7 @@ class Recordings:
         raise ConfigError(f"{name}: there are too many of that name; delete some")
 
 
-def _checked(name: Any) -> str:
+def _checked(name: object) -> str:
     """Return a name that can only mean a file directly in the folder.
 
     Raises:

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import os
-from typing import TYPE_CHECKING
 
 from app.cli.options import check_output, overrides_of
 from app.cli.prepare import progress
@@ -12,10 +11,8 @@ from app.result import to_json
 from config.yaml_files import writing
 from estimators.errors import ConfigError, printable
 
+from ..arguments import GuardCommand as Arguments
 from .suite import chosen, guard_all, guard_json, guard_topics, junit, keep_last
-
-if TYPE_CHECKING:
-    from ..arguments import GuardCommand as Arguments
 
 
 def guard(arguments: Arguments) -> int:

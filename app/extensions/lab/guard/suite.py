@@ -10,9 +10,8 @@ import xml.etree.ElementTree as ET
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any
 
-from app.result import Topic
+from app.result import JsonObject, Topic
 from app.study.compare import draws, tidy, within
 from app.study.processes import results
 from app.twin.log_reader import read_log
@@ -362,7 +361,7 @@ def guard_topics(found: Sequence[GuardVerdict], absent_fails: bool) -> list[Topi
     return topics
 
 
-def guard_json(found: Sequence[GuardVerdict]) -> list[dict[str, Any]]:
+def guard_json(found: Sequence[GuardVerdict]) -> list[JsonObject]:
     """Return the verdicts for scripts, one object per recording; `change` is for the worse if positive."""
     return [
         {

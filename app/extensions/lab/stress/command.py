@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
-
 from app.cli.options import overrides_of
 from app.cli.prepare import opened, prepare, progress
 from app.render.text import to_text
@@ -12,12 +10,10 @@ from app.terminal import complain
 from estimators.errors import ConfigError
 from estimators.registry import find_estimator
 
+from ..arguments import StressCommand as Arguments
 from .detection import Trial
 from .results import stress_topics
 from .trials import Trials, all_trials
-
-if TYPE_CHECKING:
-    from ..arguments import StressCommand as Arguments
 
 
 def stress_twin(arguments: Arguments) -> int:

@@ -6,7 +6,7 @@ from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field, replace
 from functools import partial
 from math import nan
-from typing import TYPE_CHECKING, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 
@@ -23,13 +23,11 @@ from estimators.model.state_space import StateSpaceModel
 from estimators.snapshots import Base
 from estimators.track import TRACKING, USABLE, WAITING
 from estimators.tuning import Tuning
+from sources.faults.kinds import Fault
 from sources.faults.layer import Faults, FaultySource
 from sources.merged import MemorySource
 from sources.simulator import Simulator
-
-if TYPE_CHECKING:
-    from sources.faults.kinds import Fault
-    from sources.source import Source
+from sources.source import Source
 
 AT_ONCE = "two at once"
 
