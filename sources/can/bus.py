@@ -12,7 +12,7 @@ from collections import Counter
 from collections.abc import Callable, Iterable, Iterator, Mapping
 from contextlib import suppress
 from itertools import islice
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import can
 
@@ -255,9 +255,6 @@ class SocketLoss:
             )
         self._before, self._received = count or 0, 0
 
-
-if TYPE_CHECKING:
-    from .decoder import Decoder
 
 MISSING_AFTER_S = 5.0
 MISSING_PERIODS = 3.0

@@ -56,12 +56,11 @@ class Decoder:
     ) -> None:
         self._report = report
         self.width = width
-        found = [(Path(path), bus) for path, bus in databases]
-        for path, _ in found:
+        for path, _ in databases:
             load_database(path)
         grouped: dict[int, tuple[Any, BusName, Path, list[Channel]]] = {}
         for channel in channels:
-            messages, bus, path = find_messages(found, channel)
+            messages, bus, path = find_messages(databases, channel)
             for message in messages:
                 grouped.setdefault(id(message), (message, bus, path, []))[3].append(channel)
         self._plans = list(grouped.values())
@@ -165,8 +164,8 @@ class Decoder:
         t = raw.t[rows]
         return Frames(t, t, plan[rows], raw.length[rows], raw.data[rows])
 
-    def gather(self, messages: Sequence[Any], arrivals: Sequence[int] | None) -> Frames:
-        """Return the wanted messages of python-can as arrays; `arrivals` (ns) None takes the frames' own times.
+    def gather(self, messages: Sequence[Any], arrivals: Sequence[int]) -> Frames:
+        """Return the wanted messages of python-can, which came at `arrivals` (ns), as arrays.
 
         Error and remote frames carry no data and are left out.
         """
@@ -181,19 +180,13 @@ class Decoder:
                 continue
             plan.append(which)
             t.append(second_ns(message.timestamp))
-            if arrivals is not None:
-                arrival.append(arrivals[k])
+            arrival.append(arrivals[k])
             data = bytes(message.data[:longest])
             length.append(len(data))
             chunks.append(data.ljust(longest, b"\0"))
-        times = np.array(t, np.int64)
-        return Frames(
-            times,
-            times if arrivals is None else np.array(arrival, np.int64),
-            np.array(plan, np.int64),
-            np.array(length, np.int64),
-            np.frombuffer(bytearray().join(chunks), np.uint8).reshape(len(chunks), longest),
-        )
+        numbers = (np.array(column, np.int64) for column in (t, arrival, plan, length))
+        rows = np.frombuffer(bytearray().join(chunks), np.uint8).reshape(len(chunks), longest)
+        return Frames._make((*numbers, rows))
 
     def decode(self, frames: Frames) -> Events:
         """Return the events of frames, in their order; the same for live frames and a recording."""
@@ -355,7 +348,7 @@ def same_bus(wanted: BusName, actual: BusName) -> bool:
     return digits != "" and int(digits) == number
 
 
-def find_messages(databases: list[tuple[Path, BusName]], channel: Channel) -> tuple[list[Any], BusName, Path]:
+def find_messages(databases: Sequence[tuple[Path, BusName]], channel: Channel) -> tuple[list[Any], BusName, Path]:
     """Return the messages that carry a channel, with bus and path of the first database that has them.
 
     There are several if a DBC gives one name to messages of different ids (two devices of a kind).

@@ -198,7 +198,7 @@ def lost_records(mdf: Any, content: Any) -> str:
     lost = kept = records = 0
     for members in groups.values():
         data = members[0].data_group
-        if any(group.channel_group.flags & VLSD and _has_data(group) for group in members):
+        if any(group.channel_group.flags & VLSD and any(group.signal_data or ()) for group in members):
             continue  # Only the records themselves hold their lengths.
         try:
             promised = _size(content, int(data.data_block_addr), set())
@@ -220,18 +220,6 @@ def lost_records(mdf: Any, content: Any) -> str:
     return f"{lost} of {kept + lost} bytes of records{about} were not read"
 
 
-def _has_data(group: Any) -> bool:
-    return any(bool(blocks) for blocks in (group.signal_data or ()))
-
-
-def _block(content: Any, address: int) -> tuple[bytes, int, tuple[int, ...]]:
-    """Return a block's name, its length, and the addresses of its links."""
-    name, _, length, links = _HEADER.unpack_from(content, address)
-    if links > len(content) // 8:
-        raise ValueError(f"the block at {address:#x} has {links} links")
-    return name, length, struct.unpack_from(f"<{links}Q", content, address + _HEADER.size)
-
-
 def _size(content: Any, address: int, seen: set[int]) -> int | None:
     """Return the bytes of records in a data block, or in a list of them; None if they are stored by column."""
     total = 0
@@ -243,7 +231,10 @@ def _size(content: Any, address: int, seen: set[int]) -> int | None:
         if address in seen:
             raise ValueError(f"the block at {address:#x} is linked to twice")
         seen.add(address)
-        name, length, links = _block(content, address)
+        name, _, length, count = _HEADER.unpack_from(content, address)
+        if count > len(content) // 8:
+            raise ValueError(f"the block at {address:#x} has {count} links")
+        links = struct.unpack_from(f"<{count}Q", content, address + _HEADER.size)
         if name == b"##DT":
             total += length - _HEADER.size
         elif name == b"##DZ":

@@ -142,13 +142,6 @@ def extract(signals, plan, length, data, values, state, bad):
                     bad[i] = 1
 
 
-def _network_start(signal: Any) -> int:
-    """Return the number of bits before the signal's first one, in the order in which its bytes are read."""
-    if signal.byte_order == "little_endian":
-        return int(signal.start)
-    return 8 * (int(signal.start) // 8) + (7 - int(signal.start) % 8)
-
-
 def vectorises(signal: Any) -> bool:
     """Return whether `extract` gives the values of cantools; otherwise cantools decodes the message, frame by frame."""
     conversion = signal.conversion
@@ -180,6 +173,8 @@ def ordered(message: Any, names: tuple[str, ...]) -> list[Any]:
 
 def tabulate(messages: list[tuple[Any, list[Any]]]) -> Signals:
     """Return the tables of messages (cantools) and their wanted signals, in the order of `ordered`."""
+    from cantools.database.utils import start_bit  # Here, not above: processes that compile have no signals.
+
     tables = SimpleNamespace(**{name: [] for name in Signals._fields})
     for starts in (tables.first, tables.ids_first, tables.known_first):
         starts.append(0)
@@ -187,7 +182,7 @@ def tabulate(messages: list[tuple[Any, list[Any]]]) -> Signals:
         names = [signal.name for signal in signals]
         for signal in signals:
             floats = FLOAT32 if signal.length == 32 else FLOAT64
-            tables.start.append(_network_start(signal))
+            tables.start.append(start_bit(signal))
             tables.length.append(signal.length)
             tables.big.append(signal.byte_order != "little_endian")
             tables.kind.append(floats if signal.is_float else SIGNED if signal.is_signed else UNSIGNED)
