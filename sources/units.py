@@ -233,7 +233,6 @@ def _has_dimension(unit: str) -> bool:
 
 _HEADING = re.compile(r".+?\s*[\[(]([^\[\]()]+)[\])]\s*")
 
-
 _ELEMENT = re.compile(r"/\S+\.\S+\[[^\[\]]+\]")
 """Element of a field of a ROS topic, whose name is no unit: /joint_states.position[arm]."""
 
