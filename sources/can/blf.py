@@ -10,7 +10,6 @@ import os
 import re
 import zlib
 from collections.abc import Iterator
-from typing import Any
 
 import can
 import numpy as np
@@ -42,7 +41,7 @@ class BlfBlocks(can.BLFReader):
     bad: tuple[tuple[str, object], ...] = ()
     """Places of the blocks that could not be read, and why."""
 
-    def __iter__(self) -> Iterator[Any]:
+    def __iter__(self) -> Iterator[can.Message | Raw]:
         begin = self.file.tell()
         while data := self.file.read(HEAD.size):
             place, error = self.file.tell() - len(data), None
@@ -82,7 +81,7 @@ class BlfBlocks(can.BLFReader):
             self.file.seek(1 - HEAD.size, os.SEEK_CUR)
         return False
 
-    def _parse_container(self, data: bytes) -> Iterator[Any]:
+    def _parse_container(self, data: bytes) -> Iterator[can.Message | Raw]:
         # After a block that could not be read, an object of it may end here.
         joined = self._tail + data if self._tail else data[max(0, data.find(MARK)) :]
         found = frames_of(joined, self.start_timestamp)

@@ -6,10 +6,11 @@ import logging
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from functools import lru_cache
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import cantools
 import numpy as np
+from cantools.database.can import Database, Message, Signal
 
 from estimators.errors import SourceError, nearest
 from estimators.log import READING, Events
@@ -18,6 +19,7 @@ from ..mapping import ABSENT, PRESENT, SHORT, ChannelMapping
 from ..source import Channel, Report, ignore
 from ..units import declared_conversion, second_ns
 from ..worker_process import gist
+from . import sockets
 from .limits import SignalLimits, span_of
 from .readers import EXTENDED, BusName, Raw
 from .signals import extract, ordered, tabulate, vectorises
@@ -58,7 +60,7 @@ class Decoder:
         self.width = width
         for path, _ in databases:
             load_database(path)
-        grouped: dict[int, tuple[Any, BusName, Path, list[Channel]]] = {}
+        grouped: dict[int, tuple[Message, BusName, Path, list[Channel]]] = {}
         for channel in channels:
             messages, bus, path = find_messages(databases, channel)
             for message in messages:
@@ -104,7 +106,7 @@ class Decoder:
                     )
 
     @property
-    def filters(self) -> list[dict[str, Any]]:
+    def filters(self) -> list[dict[str, int]]:
         """Filters of python-can for the wanted ids."""
         return [
             {
@@ -164,7 +166,7 @@ class Decoder:
         t = raw.t[rows]
         return Frames(t, t, plan[rows], raw.length[rows], raw.data[rows])
 
-    def gather(self, messages: Sequence[Any], arrivals: Sequence[int]) -> Frames:
+    def gather(self, messages: Sequence[sockets.Message], arrivals: Sequence[int]) -> Frames:
         """Return the wanted messages of python-can, which came at `arrivals` (ns), as arrays.
 
         Error and remote frames carry no data and are left out.
@@ -222,7 +224,7 @@ class Decoder:
             state[i, j] = missing if value is None else PRESENT
 
     @staticmethod
-    def _excluded(message: Any, name: str, found: dict[str, Any]) -> bool:
+    def _excluded(message: Message, name: str, found: dict[str, float]) -> bool:
         """Return whether a multiplexer excludes the signal from the frame."""
         signal = message.get_signal_by_name(name)
         while signal.multiplexer_signal is not None:
@@ -303,7 +305,7 @@ def _list(buses: Sequence[BusName]) -> str:
     return shown + (", ..." if len(buses) > MAX_NAMED_IDS else "")
 
 
-def load_database(path: Path) -> Any:
+def load_database(path: Path) -> Database:
     """Load a database file (DBC, or any other that cantools reads), cached while the file is unchanged.
 
     Raises:
@@ -317,7 +319,7 @@ def load_database(path: Path) -> Any:
 
 
 @lru_cache(maxsize=16)
-def _load(path: Path, stamp: int) -> Any:
+def _load(path: Path, stamp: int) -> Database:
     logger = logging.getLogger("cantools")
     level = logger.level
     logger.setLevel(logging.ERROR)  # It warns of duplicate names, which are harmless.
@@ -328,7 +330,7 @@ def _load(path: Path, stamp: int) -> Any:
         raise SourceError(f"{path}: it cannot be read as a DBC ({gist(error)}); check that it is one") from None
     finally:
         logger.setLevel(level)
-    if not isinstance(database, cantools.database.can.Database):
+    if not isinstance(database, Database):
         raise SourceError(f"{path}: it describes no CAN messages; give a DBC")
     protocol = database.dbc.attributes.get("ProtocolType") if database.dbc is not None else None
     if protocol is not None and protocol.value == "J1939" and "VFrameFormat" not in database.dbc.attribute_definitions:
@@ -348,7 +350,7 @@ def same_bus(wanted: BusName, actual: BusName) -> bool:
     return digits != "" and int(digits) == number
 
 
-def find_messages(databases: Sequence[tuple[Path, BusName]], channel: Channel) -> tuple[list[Any], BusName, Path]:
+def find_messages(databases: Sequence[tuple[Path, BusName]], channel: Channel) -> tuple[list[Message], BusName, Path]:
     """Return the messages that carry a channel, with bus and path of the first database that has them.
 
     There are several if a DBC gives one name to messages of different ids (two devices of a kind).
@@ -387,7 +389,7 @@ def ends_of(databases: list[tuple[Path, BusName]], channel: Channel) -> tuple[tu
     return tuple(tuple(slope * end + shift for end in span_of(signal)[:2]) for signal, slope, shift in found)
 
 
-def slopes(message: Any, channel: Channel) -> Iterator[tuple[Any, float, float]]:
+def slopes(message: Message, channel: Channel) -> Iterator[tuple[Signal, float, float]]:
     """Yield each signal of a channel with slope and shift of its conversion to the model's unit.
 
     Raises:

@@ -7,9 +7,9 @@ import threading
 import time
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from pathlib import Path
-from typing import Any
 
 import can
+from cantools.database.can import Message
 
 from estimators.errors import SourceError
 from estimators.log import INPUT, READING, TRUTH, Events
@@ -53,9 +53,9 @@ class Player:
         *,
         interface: str,
         channel: str | int,
-        bus_options: Mapping[str, Any] | None = None,
+        bus_options: Mapping[str, object] | None = None,
         report: Report = ignore,
-        connect: Callable[[], Any] | None = None,
+        connect: Callable[[], can.BusABC] | None = None,
         clock: Callable[[], int] = time.monotonic_ns,
     ) -> None:
         self._source = source
@@ -140,7 +140,7 @@ class Player:
 class _Frame:
     """A message and its current values."""
 
-    def __init__(self, message: Any) -> None:
+    def __init__(self, message: Message) -> None:
         self.message = message
         self.values: dict[str, float] = {}
         for signal in message.signals:

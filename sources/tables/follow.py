@@ -42,6 +42,8 @@ LEFT_OUT = "file left out"
 PARQUET_END = b"PAR1"
 """Last bytes of a complete Parquet file."""
 
+_Batch = Events | AssetEvents
+
 
 @dataclass
 class _File:
@@ -112,7 +114,7 @@ class FollowedTable(Source):
         self._fed = {name: channel.name for channel in channels for name in channel.needed}
         self._valueless = set(range(len(self._columns)))
         nothing = Events.empty(width)
-        self._nothing = nothing if asset is None else AssetEvents(nothing, np.zeros(0, np.int64), ())
+        self._nothing: _Batch = nothing if asset is None else AssetEvents(nothing, np.zeros(0, np.int64), ())
         self._files: dict[int, _File] = {}
         self._open: tuple[int, Path, BinaryIO] | None = None
         """Inode, path and handle of the file that was read last; if it was moved away, its rest is read from here."""
@@ -170,7 +172,7 @@ class FollowedTable(Source):
             if file.rows is not None:
                 file.rows.close()  # type: ignore[attr-defined]
 
-    def _next(self) -> Any:
+    def _next(self) -> _Batch | None:
         """Return the events of the next piece of the first file that has one; None if there is none."""
         present: list[tuple[Path, os.stat_result]] = []
         try:
@@ -214,7 +216,7 @@ class FollowedTable(Source):
             self._open[2].close()
         self._open = None
 
-    def _of(self, path: Path) -> Any:
+    def _of(self, path: Path) -> _Batch | None:
         """Return the events of the next piece of a file; None if it has none."""
         handle = path.open("rb")
         try:
@@ -234,7 +236,7 @@ class FollowedTable(Source):
         self._open = (stat.st_ino, path, handle)
         return events
 
-    def _piece(self, path: Path, handle: BinaryIO, file: _File) -> Any:
+    def _piece(self, path: Path, handle: BinaryIO, file: _File) -> _Batch | None:
         """Return the events of the next complete lines or rows; None if there are none."""
         if not _is_plain(path):
             return self._rows(path, handle, file)
@@ -258,7 +260,7 @@ class FollowedTable(Source):
         self._advance(handle, file, file.offset + end, file.line + len(lines))
         return events
 
-    def _rows(self, path: Path, handle: BinaryIO, file: _File) -> Any:
+    def _rows(self, path: Path, handle: BinaryIO, file: _File) -> _Batch | None:
         """Return the events of the next rows of a file that is no plain CSV; None if there are none."""
         size = os.fstat(handle.fileno()).st_size
         if file.rows is None:
@@ -328,7 +330,7 @@ class FollowedTable(Source):
 
     def _events(
         self, path: Path, lines: list[str], before: int, kind: CsvFormat, times: TimeReader, came: int | None
-    ) -> Any:
+    ) -> _Batch:
         """Return the events of the lines that follow so many lines of a file, and `came` at that time, ns."""
         rows, numbers = [], []
         problems: list[tuple[str, int, str]] = []
@@ -352,7 +354,7 @@ class FollowedTable(Source):
             self._report(key, f"{path.name}:{number}: {text}")
         return self._nothing if found is None else self._batch(path, found, came)
 
-    def _batch(self, path: Path, found: TableRows, came: int | None = None) -> Any:
+    def _batch(self, path: Path, found: TableRows, came: int | None = None) -> _Batch:
         """Return the events of rows, which `came` at that time, ns; None if it is not known, as of a recording."""
         for key, number, text in found.problems:
             self._report(key, f"{path.name}:{number}: {text}")
