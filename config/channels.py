@@ -76,16 +76,14 @@ class ChannelSection(Section):
     @model_validator(mode="after")
     def _lengths(self) -> ChannelSection:
         count = len(self.names())
-        for key in ("units", "scale", "offset"):
-            values = getattr(self, key)
+        entries = [(key, "has {} entries", getattr(self, key)) for key in ("units", "scale", "offset")]
+        if own := self.accuracy:
+            texts = {"names {}": own.names, "units has {}": own.units, "scale has {}": own.scale}
+            entries += [("accuracy", text, values) for text, values in texts.items()]
+        for key, text, values in entries:
             if values is not None and len(values) not in (1, count):
-                text = f"has {len(values)} entries; give one, or one for each of the {count} values"
+                text = f"{text.format(len(values))}; give one, or one for each of the {count} values"
                 raise refused("relation", text, key)
-        own = self.accuracy
-        for word, entries in (("names", own.names), ("units has", own.units), ("scale has", own.scale)) if own else ():
-            if entries is not None and len(entries) not in (1, count):
-                text = f"{word} {len(entries)}; give one, or one for each of the {count} values"
-                raise refused("relation", text, "accuracy")
         if self.convert == "east_north" and count != 2:
             text = f"is east_north; it needs two values, latitude and longitude, and {count} are named"
             raise refused("relation", text, "convert")

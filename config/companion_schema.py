@@ -19,16 +19,7 @@ from .fields import (
     Validity,
     as_list,
 )
-from .schema import (
-    EstimatorSection,
-    GateProbability,
-    GateSection,
-    NormalSection,
-    Parameters,
-    PriorSection,
-    as_estimator,
-    as_gate,
-)
+from .schema import AS_ESTIMATOR, EstimatorSection, Gate, NormalSection, Parameters, PriorSection
 
 
 class TunedSensorSection(SpreadSection):
@@ -105,9 +96,7 @@ class TuningSection(Section):
 
     version: VersionSection
     """Origin and scores."""
-    estimator: Annotated[
-        EstimatorSection | None, BeforeValidator(as_estimator, json_schema_input_type=str | EstimatorSection)
-    ] = None
+    estimator: Annotated[EstimatorSection | None, AS_ESTIMATOR] = None
     """The filter, with all of its options that are not the catalogue's."""
     filters: dict[str, dict[str, Option]] = {}
     """Options of other filters, by name."""
@@ -123,9 +112,7 @@ class TuningSection(Section):
     """Process noise Q by name."""
     sensors: dict[str, TunedSensorSection] = {}
     """Sensor noise R by sensor."""
-    gate: Annotated[
-        GateSection | None, BeforeValidator(as_gate, json_schema_input_type=GateProbability | GateSection | None)
-    ] = None
+    gate: Gate = None
     """The gate; null for none."""
     baseline: dict[str, NormalSection] = {}
     """Baseline by sensor row, recorded when it was accepted."""

@@ -136,7 +136,7 @@ def registered(kind: Kind) -> dict[str, tuple[str, Part]]:
     for name, item in extensions().items():
         for key, part in getattr(item, kind).items():
             if key in RESERVED.get(kind, ()) or found.setdefault(key, (name, part)) != (name, part):
-                _report(f"extension {name}: {key} of its {kind} is left out, as there is one of that name")
+                warn(f"extension {name}: {key} of its {kind} is left out, as there is one of that name")
     return found
 
 
@@ -196,7 +196,7 @@ def maker(kind: Kind, key: str, asked: str = "", extra: str = "") -> Callable[..
     except Exception as error:  # noqa: BLE001  the module may be of a third party
         raise ConfigError(f"extension {name}: {_gist(error)}; install its package again") from None
 
-    def guarded(*given: Any) -> Any:
+    def guarded(*given: object) -> object:
         try:
             found = make(*given)
         except (NisusError, OSError):
@@ -210,7 +210,7 @@ def maker(kind: Kind, key: str, asked: str = "", extra: str = "") -> Callable[..
     return guarded if kind in GUARDED else make
 
 
-def made(kind: Kind, *given: Any) -> list[Any]:
+def made(kind: Kind, *given: object) -> list[Any]:
     """Return what the functions of all parts of a kind make; what fails is reported, and left out."""
     parts = registered(kind).items()
     tried = (_tried(name, partial(lambda key: maker(kind, key)(*given), key)) for key, (name, _) in parts)
@@ -232,10 +232,10 @@ def _gist(error: BaseException) -> str:
 def _leave_out(name: str, why: str) -> None:
     if name not in _left_out:
         _left_out[name] = why
-        _report(f"extension {name} is left out: {why}")
+        warn(f"extension {name} is left out: {why}")
 
 
-def _report(text: str) -> None:
+def warn(text: str) -> None:
     """Log a line, once for all processes of a command."""
     if multiprocessing.parent_process() is None:
         logging.getLogger("nisus").warning(text)

@@ -90,7 +90,7 @@ Repeats = Annotated[str, AfterValidator(_repeats)]
 Count = Annotated[int, Field(strict=True, ge=1)]
 
 
-def as_choice(value: Any) -> Any:
+def as_choice(value: object) -> object:
     """Return the word of a switch: `adapt: false` is off."""
     return {True: "on", False: "off"}[value] if isinstance(value, bool) else value
 
@@ -131,7 +131,7 @@ class Section(BaseModel):
 
     @model_validator(mode="before")
     @classmethod
-    def _known_keys(cls, data: Any) -> Any:
+    def _known_keys(cls, data: object) -> object:
         # Before pydantic's own check, which reports the stray key but not its neighbours.
         if isinstance(data, dict):
             fields = cls.model_fields
@@ -176,7 +176,7 @@ def one_of(section: Section, *keys: str, required: bool) -> None:
 Pair = tuple[Number | None, Number | None]
 
 
-def as_pair(value: Any) -> Any:
+def as_pair(value: object) -> object:
     """Refuse a list that is no pair."""
     if isinstance(value, (list, tuple)) and len(value) != 2:
         raise refused("value", "give the least and the greatest value, null for none")
@@ -223,7 +223,7 @@ class BoundedSection(Section):
         return self
 
 
-def _kind(given: Any) -> str:
+def _kind(given: object) -> str:
     return "bounded" if isinstance(given, (dict, BoundedSection)) else "plain"
 
 
@@ -331,7 +331,7 @@ def _values(given: float | tuple[float, ...] | BoundedSection) -> tuple[float, .
     return given if isinstance(given, tuple) else (given,)
 
 
-def _bounds(variance: Any, std: Any) -> tuple[float, float] | None:
+def _bounds(variance: object, std: object) -> tuple[float, float] | None:
     if isinstance(variance, BoundedSection):
         return variance.ends
     return (std.ends[0] ** 2, min(std.ends[1] ** 2, LARGEST)) if isinstance(std, BoundedSection) else None
@@ -346,7 +346,7 @@ class ConditionSection(Section):
     """Text, or a list of texts. Default: null, the column holds numbers."""
 
 
-def _condition(value: Any) -> Any:
+def _condition(value: object) -> object:
     if isinstance(value, bool):
         value = int(value)
     if isinstance(value, (int, float)):
@@ -362,7 +362,7 @@ Condition = Annotated[
 ]
 
 
-def _as_pairs(value: Any) -> Any:
+def _as_pairs(value: object) -> object:
     """Return a single pair as a list of one."""
     if not isinstance(value, (list, tuple)) or any(isinstance(item, (list, tuple)) for item in value):
         return value

@@ -126,7 +126,8 @@ def load_text(
     except ValidationError as error:
         raise report(error, data, places) from None
     if config.name is None:
-        config = config.model_copy(update={"name": _name(path)})
+        name = "".join(letter if letter.isalnum() or letter in "_-" else "_" for letter in path.stem) or "twin"
+        config = config.model_copy(update={"name": name})
     without = None if version is None else load_text(text, path, overrides)
     return Loaded(config, path, text, places, version, without)
 
@@ -165,14 +166,14 @@ def moved(text: str, path: Path, out: Path) -> str:
     return changed
 
 
-def _paths_of(data: Any, there: Callable[[str], str], folder: Path) -> Iterator[tuple[Key, Any]]:
+def _paths_of(data: Any, there: Callable[[str], str], folder: Path) -> Iterator[tuple[Key, object]]:
     """Yield key and new value of every path of a twin's data; `folder` is that of its file."""
 
     def file_of(reference: str) -> str:
         file, colon, name = reference.rpartition(":")
         return f"{there(file)}:{name}" if colon else reference
 
-    def of_source(section: Any, key: Key) -> Iterator[tuple[Key, Any]]:
+    def of_source(section: object, key: Key) -> Iterator[tuple[Key, object]]:
         if not isinstance(section, dict):
             return
         root = section.get("folder")
@@ -203,10 +204,6 @@ def _paths_of(data: Any, there: Callable[[str], str], folder: Path) -> Iterator[
     if data.get("correction") is not None:
         yield ("correction",), there(data["correction"])
     yield from of_source(data.get("source"), ("source",))
-
-
-def _name(path: Path) -> str:
-    return "".join(letter if letter.isalnum() or letter in "_-" else "_" for letter in path.stem) or "twin"
 
 
 def _override(data: dict[str, Any], places: ValuePlaces, dotted_key: str, text: str) -> None:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Annotated, Any, Union
+from typing import TYPE_CHECKING, Annotated, Union
 
 from pydantic import BeforeValidator, Discriminator, Field, Tag
 
@@ -47,7 +47,7 @@ KINDS: dict[str, type[Section]] = {"matrices": MatricesSection} | schemas("model
 """Sections of models by the key of their file."""
 
 
-def kind_of(model: Any) -> str:
+def kind_of(model: object) -> str:
     """Return the key of the file in a model, as a section or YAML; empty if it is a reference."""
     keys = model if isinstance(model, dict) else ()
     return next((key for key, kind in KINDS.items() if key in keys or isinstance(model, kind)), "")
@@ -58,7 +58,7 @@ def model_file(model: Model) -> str:
     return model if isinstance(model, str) else str(getattr(model, kind_of(model)))
 
 
-def _named(value: Any) -> Any:
+def _named(value: object) -> object:
     if isinstance(value, dict) and not kind_of(value):
         raise refused("no_kind", f"names {'neither' if len(KINDS) > 1 else 'no'} {' nor '.join(KINDS)}")
     return value

@@ -5,11 +5,9 @@ The text is rewritten, so that the schema and everything behind it know one name
 
 from __future__ import annotations
 
-import logging
-import multiprocessing
 import re
 import shutil
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Collection, Iterator, Mapping
 from contextlib import suppress
 from functools import cache
 from itertools import count
@@ -20,9 +18,11 @@ import yaml
 
 from estimators.errors import ConfigError
 
+from .extensions import warn
 from .yaml_files import MERGE, Key, ValuePlaces, composed, dotted, end_of, parse, writing
 
 ANY = None
+_tell = cache(warn)
 
 CHANNELS = [("source", group, ANY) for group in ("sensors", "inputs", "truth")]
 
@@ -58,7 +58,7 @@ BOUNDED = [
 """Keys whose value was {value, from, to} and is {value, range: [low, high]}."""
 
 
-def _like(key: Key, patterns: Any) -> tuple[str | None, ...] | None:
+def _like(key: Key, patterns: Collection[tuple[str | None, ...]]) -> tuple[str | None, ...] | None:
     """Return the pattern that a key has; a part of a source, and its asset, are like a source."""
     while key[:1] == ("source",) and key[1:2] in (("parts",), ("asset",)):
         key = ("source", *key[3 if key[1] == "parts" else 2 :])
@@ -161,12 +161,6 @@ def rewrite(path: Path, change: Callable[[str], str], out: Path | None = None) -
     return kept
 
 
-@cache
-def _tell(text: str) -> None:
-    if multiprocessing.parent_process() is None:
-        logging.getLogger("nisus").warning(text)
-
-
 WORDS = {way[-1] for way in RENAMED} | {"min", "max", "from", "to"}
 
 
@@ -186,7 +180,7 @@ def _edited(text: str, edits: dict[int, tuple[int, str]]) -> str:
     return text
 
 
-def _edits(node: Any, key: Key, text: str) -> Iterator[tuple[int, tuple[int, str]]]:
+def _edits(node: yaml.Node | None, key: Key, text: str) -> Iterator[tuple[int, tuple[int, str]]]:
     """Yield the spans that have new text, as (begin, (end, text)); `key` has new names."""
     if isinstance(node, yaml.SequenceNode):
         for k, item in enumerate(node.value):
@@ -224,7 +218,7 @@ def _edits(node: Any, key: Key, text: str) -> Iterator[tuple[int, tuple[int, str
         yield from _edits(item, new, text)
 
 
-def _interval(entries: dict[str, Any], key: Key, text: str) -> str | None:
+def _interval(entries: dict[str, yaml.Node], key: Key, text: str) -> str | None:
     """Return a mapping that is an interval of before in the notation of now; None if it is none."""
     given = {name: text[item.start_mark.index : end_of(item)] for name, item in entries.items()}
     if _like(key, INTERVALS) and {"min", "max"} & set(given) and set(given) <= {"min", "max", "extrapolate"}:

@@ -22,7 +22,7 @@ MAX_SHOWN_ITEMS = 40  # Characters up to which a list or mapping is shown in ful
 MAX_LISTED_WORDS = 8  # Choices up to which all are listed; of more, the nearest ones
 
 
-def shown(value: Any) -> str:
+def shown(value: object) -> str:
     """Return a value as an error shows it."""
     if value is None:
         return "empty"
@@ -61,7 +61,7 @@ def check_section(kind: type[S], text: str, path: Path, rule: str) -> tuple[S, d
         raise report(error, data, places) from None
 
 
-def report(error: ValidationError, data: Any, places: ValuePlaces) -> ConfigError:
+def report(error: ValidationError, data: object, places: ValuePlaces) -> ConfigError:
     """Return one ConfigError with a line for each of the first problems."""
     found: dict[tuple, str] = {}  # One line a key: pydantic repeats itself for each kind that a value might have been.
     problems = error.errors(include_url=False)
@@ -79,7 +79,7 @@ def report(error: ValidationError, data: Any, places: ValuePlaces) -> ConfigErro
     return ConfigError("\n".join(lines))
 
 
-def _line(problem: ErrorDetails, key: Key, value: Any, places: ValuePlaces) -> str:
+def _line(problem: ErrorDetails, key: Key, value: object, places: ValuePlaces) -> str:
     kind, context = problem["type"], problem.get("ctx", {})
     if kind == "missing":
         name = problem["loc"][-1]
@@ -103,13 +103,13 @@ def _line(problem: ErrorDetails, key: Key, value: Any, places: ValuePlaces) -> s
         return f"{places.at(key)}: {dotted((*key, 'type'))} is missing; {_choices(problem)}"
     if kind == "union_tag_invalid":
         key, value = (*key, "type"), context["tag"]
-        rule = nearest(value, [item.strip("'") for item in context["expected_tags"].split(", ")]) + left_out()
+        rule = nearest(context["tag"], [item.strip("'") for item in context["expected_tags"].split(", ")]) + left_out()
     else:
         rule = _rule(kind, context, problem["msg"], value)
     return f"{places.at(key)}: {dotted(key)} is {shown(value)}; {rule}"
 
 
-def _locate(loc: tuple[str | int, ...], data: Any) -> tuple[Key, Any]:
+def _locate(loc: tuple[str | int, ...], data: object) -> tuple[Key, object]:
     """Return the part of a pydantic location that exists in the YAML, without union members and lone list items."""
     key: list[str | int] = []
     for part in loc:
@@ -124,7 +124,7 @@ def _locate(loc: tuple[str | int, ...], data: Any) -> tuple[Key, Any]:
 
 
 def _choices(problem: ErrorDetails) -> str:
-    unions: dict[Any, Any] = {("source",): SourceSection, ("outputs", "receivers"): ReceiverSection}
+    unions: dict[Key, object] = {("source",): SourceSection, ("outputs", "receivers"): ReceiverSection}
     sections = get_args(unions.get(problem["loc"][:2], PartSection))[0]
     kinds = [get_args(section.model_fields["type"].annotation)[0] for section in get_args(sections) or (sections,)]
     return f"it must be one of {', '.join(kinds)}"
@@ -161,7 +161,7 @@ _PATTERNS = {
 """Rules by the beginning of the pattern that a text breaks."""
 
 
-def _rule(kind: str, context: dict[str, Any], text: str, value: Any) -> str:
+def _rule(kind: str, context: dict[str, Any], text: str, value: object) -> str:
     if kind == "greater_than":
         return "it must be positive" if context["gt"] == 0 else f"it must be above {context['gt']:g}"
     if kind == "greater_than_equal":

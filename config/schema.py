@@ -47,7 +47,7 @@ Percent = Annotated[str, Field(pattern=PERCENT)]
 """A share, as in 10 %."""
 
 
-def _no_other_text(value: Any) -> Any:
+def _no_other_text(value: object) -> object:
     """Return a width; refuse text that is no share above zero."""
     if isinstance(value, str) and (not re.match(PERCENT, value) or not float(value.rstrip(" %")) > 0.0):
         raise refused("value", "give a positive number without a unit, or a share of the value above zero, as in 10 %")
@@ -126,7 +126,7 @@ class ParameterSection(Section):
         return {name: as_width(value, section.by) / section.per for name, section in self.widen.items()}
 
 
-def as_parameter(value: Any) -> Any:
+def as_parameter(value: object) -> object:
     """Return a number as the value of a parameter."""
     return value if isinstance(value, (dict, ParameterSection)) else {"value": value}
 
@@ -138,10 +138,7 @@ Parameters = dict[
 
 OptionalParameter = Annotated[
     ParameterSection | None,
-    BeforeValidator(
-        lambda value: value if value is None else as_parameter(value),
-        json_schema_input_type=Number | ParameterSection | None,
-    ),
+    BeforeValidator(as_parameter, json_schema_input_type=Number | ParameterSection | None),
 ]
 
 
@@ -398,14 +395,20 @@ class ViewSection(Section):
     """The three-dimensional scene. Default: the estimate over the first three states."""
 
 
-def as_estimator(value: Any) -> Any:
+def as_estimator(value: object) -> object:
     """Return a name as a filter without options."""
     return {"name": value} if isinstance(value, str) else value
 
 
-def as_gate(value: Any) -> Any:
+def as_gate(value: object) -> object:
     """Return a number as a hard gate."""
     return value if value is None or isinstance(value, (dict, GateSection)) else {"probability": value}
+
+
+AS_ESTIMATOR = BeforeValidator(as_estimator, json_schema_input_type=str | EstimatorSection)
+Gate = Annotated[
+    GateSection | None, BeforeValidator(as_gate, json_schema_input_type=GateProbability | GateSection | None)
+]
 
 
 class TwinSection(Section):
@@ -462,16 +465,12 @@ class TwinSection(Section):
     watched: Annotated[tuple[Text, ...], Field(min_length=1)] | None = None
     """States that somebody acts on: one whose corrections over its memory are too large makes the twin suspect, any
     other only itself. Default: all but parameters and errors that are estimated."""
-    estimator: Annotated[
-        EstimatorSection, BeforeValidator(as_estimator, json_schema_input_type=str | EstimatorSection)
-    ] = EstimatorSection(name="ekf")
+    estimator: Annotated[EstimatorSection, AS_ESTIMATOR] = EstimatorSection(name="ekf")
     """The filter that runs first: a name, or {name, options}. Default: ekf."""
     filters: dict[str, dict[str, Option]] = {}
     """Options of other filters, by name, used when one is selected or compared, for example
     {letkf: {radius: 4}}. Default: the catalogue's."""
-    gate: Annotated[
-        GateSection | None, BeforeValidator(as_gate, json_schema_input_type=GateProbability | GateSection | None)
-    ] = None
+    gate: Gate = None
     """Probability with which a valid measurement passes the gate, for example 0.9973; measurements outside are
     rejected. Or {probability, kind, reopen}. Default: null, no gate."""
     baseline: dict[str, NormalSection] = {}

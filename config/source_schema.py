@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from datetime import date
-from typing import TYPE_CHECKING, Annotated, Any, Literal, Union
+from typing import TYPE_CHECKING, Annotated, Literal, Union
 from zoneinfo import ZoneInfo, ZoneInfoNotFoundError, available_timezones
 
 from pydantic import AfterValidator, BeforeValidator, Field, model_validator
@@ -40,7 +40,7 @@ class DatabaseSection(Section):
     """The bus's number or name in the log, where one log holds several. Default: null, every bus."""
 
 
-def _databases(value: Any) -> Any:
+def _databases(value: object) -> list[object]:
     return [{"file": item} if isinstance(item, str) else item for item in as_list(value) or []]
 
 
@@ -88,7 +88,7 @@ class ProfileSection(Section):
         return self
 
 
-def _profiles(value: Any) -> Any:
+def _profiles(value: object) -> list[object]:
     return [
         {"constant": item} if isinstance(item, (int, float)) and not isinstance(item, bool) else item
         for item in as_list(value) or []
@@ -177,7 +177,7 @@ class CanSection(SignalMaps):
     """Interface of python-can: virtual, udp_multicast, socketcan, pcan, ..."""
     channel: Annotated[int, Field(strict=True)] | str
     """Channel of the interface: vcan0, can0, 239.74.163.2, ... Of udp_multicast each group is a bus of its own."""
-    options: dict[str, Any] = {}
+    options: dict[str, object] = {}
     """Further arguments of python-can's interface, for example {bitrate: 500000}. Default: none."""
     asset: AssetSection | None = None
     """A simulated asset: `nisus bus` plays it on the bus; with the interface `virtual` the twin does so itself."""

@@ -163,9 +163,9 @@ class _Builder:
             return self.scalar(node)
         raise self.fail(node, f"the tag {node.tag} has no meaning here; remove it")
 
-    def mapping(self, node: yaml.MappingNode, key: Key, around: tuple[int, ...]) -> dict[str, Any]:
-        data: dict[str, Any] = {}
-        merged: dict[str, Any] = {}
+    def mapping(self, node: yaml.MappingNode, key: Key, around: tuple[int, ...]) -> dict[str, object]:
+        data: dict[str, object] = {}
+        merged: dict[str, object] = {}
         for name, item in node.value:
             if name.value == MERGE and not name.style:
                 for part in item.value if isinstance(item, yaml.SequenceNode) else (item,):
@@ -183,7 +183,7 @@ class _Builder:
             data[name.value] = self.value(item, path, around)
         return {**merged, **data}
 
-    def scalar(self, node: yaml.ScalarNode) -> Any:
+    def scalar(self, node: yaml.ScalarNode) -> object:
         text = node.value
         kind = node.tag.removeprefix(_TAG)
         if kind == "null":
@@ -214,7 +214,7 @@ PLAIN = re.compile(r"[A-Za-z_][A-Za-z0-9_-]*")
 RESERVED = {"null", "true", "false"}
 
 
-def as_section(name: str, items: Mapping[str, Any]) -> list[str]:
+def as_section(name: str, items: Mapping[str, object]) -> list[str]:
     """Return a section as lines, an entry each; none if it is empty."""
     return [f"{name}:", *(f"  {_key(key)}: {as_flow(value)}" for key, value in items.items())] if items else []
 
@@ -223,7 +223,7 @@ def _key(name: str) -> str:
     return name if PLAIN.fullmatch(name) and name.lower() not in RESERVED else json.dumps(name, ensure_ascii=False)
 
 
-def as_flow(value: Any) -> str:
+def as_flow(value: object) -> str:
     """Return a value in one line of YAML."""
     if isinstance(value, Mapping):
         return "{" + ", ".join(f"{_key(key)}: {as_flow(item)}" for key, item in value.items()) + "}"
@@ -296,7 +296,7 @@ def with_section(text: str, key: str, section: str) -> str:
     return kept if found else text.rstrip("\n") + "\n\n" + section
 
 
-def with_values(text: str, values: Mapping[Key, Any]) -> tuple[str, list[Key]]:
+def with_values(text: str, values: Mapping[Key, object]) -> tuple[str, list[Key]]:
     """Return a YAML text with other values at some keys, and the keys that it does not have; comments stay.
 
     A value that an alias shares with another key counts as one that it does not have. A mapping replaces any value, and
@@ -345,7 +345,7 @@ def end_of(node: Any) -> int:
     return int(node.end_mark.index)
 
 
-def _nodes(node: Any) -> Iterator[Any]:
+def _nodes(node: yaml.Node | None) -> Iterator[yaml.Node | None]:
     """Return a node and those below it; that of an alias at each of its places."""
     yield node
     if isinstance(node, yaml.CollectionNode):

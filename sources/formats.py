@@ -20,16 +20,13 @@ COMPRESSIONS = (".gz", ".bz2", ".lz4", ".zst")
 """Endings of compressed files, after that of the format. Of CAN logs, python-can reads `.gz` only."""
 
 
-def _nothing(kind: Literal["tables", "folders"]) -> Mapping[str, Callable[[], Any]]:
+def added(kind: Literal["tables", "folders"]) -> Mapping[str, Callable[[], Any]]:
+    """Return what extensions add, each as a function that loads it; the application sets it, a reader process has none.
+
+    added("tables"): a `tables.rows.TableFormat`, by the ending of the name. added("folders"): for folders that are one
+    recording, by a file in them, a function that returns the recordings in a folder.
+    """
     return {}
-
-
-added = _nothing
-"""What extensions add, each as a function that loads it; the application sets it, a reader process has none.
-
-added("tables"): a `tables.rows.TableFormat`, by the ending of the name. added("folders"): for folders that are one
-recording, by a file in them, a function that returns the recordings in a folder.
-"""
 
 
 def tables() -> tuple[str, ...]:

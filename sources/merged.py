@@ -10,10 +10,10 @@ import numpy as np
 from estimators.errors import SourceError
 from estimators.log import Events
 
-from .source import Source, is_endless, span_of
+from .source import Recorded, Source, is_endless, span_of
 
 
-class Merged:
+class Merged(Source):
     """Merges sources that are not live; events of equal time keep the order in which the sources are given.
 
     A source whose own events step back in time (a late reading, as recorded) keeps its order: such an event comes
@@ -37,9 +37,9 @@ class Merged:
     def span(self) -> tuple[int, int] | None:
         """First and last time of all, ns; None if one is not known."""
         spans = [span_of(source) for source in self._sources]
-        if any(span is None for span in spans):
-            return None
         known = [span for span in spans if span is not None]
+        if len(known) < len(spans):
+            return None
         return min(span[0] for span in known), max(span[1] for span in known)
 
     @property
@@ -78,10 +78,6 @@ class Merged:
         joined = Events.concat(parts, 0)
         return joined.select(np.argsort(np.concatenate(orders), kind="stable"))
 
-    def now(self) -> int | None:
-        """Recordings have no clock."""
-        return None
-
     def close(self) -> None:
         """Close them all."""
         for source in self._sources:
@@ -91,33 +87,15 @@ class Merged:
 BATCH = 4096
 
 
-class MemorySource:
+class MemorySource(Recorded):
     """Returns `readings` in their order, some thousands at a time."""
-
-    live = False
 
     def __init__(self, readings: Events, *, batch: int = BATCH) -> None:
         self._readings = readings
-        self._batch = batch
-        self._next = 0
+        self._batches = (readings.select(slice(k, k + batch)) for k in range(0, len(readings), batch))
 
     @property
     def span(self) -> tuple[int, int] | None:
         """First and last time, ns."""
         t = self._readings.t
         return (int(t.min()), int(t.max())) if t.size else None
-
-    def read(self, timeout: float) -> Events | None:
-        """Return the next events; None at the end."""
-        if self._next >= len(self._readings):
-            return None
-        part = self._readings.select(slice(self._next, self._next + self._batch))
-        self._next += self._batch
-        return part
-
-    def now(self) -> int | None:
-        """Return None: it has no clock."""
-        return None
-
-    def close(self) -> None:
-        """Release nothing."""

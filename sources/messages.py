@@ -107,7 +107,7 @@ class SentNumbers:
         """Return the first and last number of each range by sender, for `restore`."""
         return {sender: [[*item] for item in ranges] for sender, ranges in self._ranges.items()}
 
-    def restore(self, state: Mapping[str, Any]) -> None:
+    def restore(self, state: Mapping[str, Sequence[Sequence[int]]]) -> None:
         """Take over the `state` of another."""
         self._ranges = OrderedDict((sender, [[*map(int, item)] for item in ranges]) for sender, ranges in state.items())
 
@@ -197,7 +197,7 @@ class Messages:
                 self._waiting.put(rows)
         return answers
 
-    def _take(self, message: Any, t: np.ndarray, values: np.ndarray, state: np.ndarray) -> Answer | None:
+    def _take(self, message: object, t: np.ndarray, values: np.ndarray, state: np.ndarray) -> Answer | None:
         """Write the values of a message into its row; return why it is refused, None if it is not."""
         if not isinstance(message, Mapping) or not isinstance(message.get("values"), Mapping):
             return Answer(REFUSED, 'it must be an object with values, such as {"values": {"NAME": 1.2}}')
@@ -317,7 +317,7 @@ class Messages:
             self.closed = True
 
 
-def _ns(value: Any) -> int | str:
+def _ns(value: object) -> int | str:
     """Return a time as ns, or why it is none."""
     if isinstance(value, str):
         found = ns_of_iso(value)
@@ -331,5 +331,5 @@ def _ns(value: Any) -> int | str:
     return value if -LATEST < value < LATEST else f"time is {value} ns; it must be before the year 2116"
 
 
-def _shown(value: Any) -> str:
+def _shown(value: object) -> str:
     return shown_name(str(value)) if isinstance(value, str) else shown_name(repr(value))

@@ -82,9 +82,7 @@ class Pacer:
             return position if known is None else min(position, known)
 
     def _position(self) -> int | None:
-        if self._playhead is None or not np.isfinite(self.speed):
-            return self._playhead
-        if self.paused:
+        if self._playhead is None or self.paused or not np.isfinite(self.speed):
             return self._playhead
         gone = (self._clock() - self._anchor) * self.speed
         return min(MAX_TIME_NS, self._playhead + round(gone)) if gone < MAX_TIME_NS else MAX_TIME_NS

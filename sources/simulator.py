@@ -16,6 +16,7 @@ from estimators.numerics.jit import plain
 from estimators.numerics.linalg import wrapped
 
 from .faults.kinds import NEVER_NS, Change
+from .source import Source
 
 BATCH_EVENTS = 32  # Events after which `read` returns; a change of the asset affects unread events only
 
@@ -32,7 +33,7 @@ class SensorPlan:
     drop_every: int | None = None
 
 
-class Simulator:
+class Simulator(Source):
     """Source of a simulated asset, as fast as it is read.
 
     In each step, in this order: the mode jumps, where the model has one; x ← f(x, u, p, dt) + w with w ~ N(0, Q); then
@@ -241,13 +242,6 @@ class Simulator:
         if self._factor is None or key != self._factor[0]:
             self._factor = (key, factor(Q))
         return np.sum(self._factor[1] * self._rng.standard_normal(self._x.size), axis=1)
-
-    def now(self) -> int | None:
-        """Return None: a simulation has no clock."""
-        return None
-
-    def close(self) -> None:
-        """Release nothing."""
 
 
 def factor(Q: np.ndarray) -> np.ndarray:

@@ -44,9 +44,11 @@ class Source(Protocol):
 
     def now(self) -> int | None:
         """Return the present time of the source, ns; None if it has no clock."""
+        return None
 
     def close(self) -> None:
-        """Close files and buses."""
+        """Close files and buses, if it has any."""
+        return None
 
 
 class Paced(Source, Protocol):
@@ -99,7 +101,7 @@ class Acknowledging(Marked, Protocol):
         """Acknowledge all that was read: it has been stored; in the thread that reads."""
 
 
-class Recorded:
+class Recorded(Source):
     """What sources of recordings share: their events are those of a generator."""
 
     live = False
@@ -110,10 +112,6 @@ class Recorded:
         """Return the next events; none if there are none within `timeout` seconds; None at the end."""
         self._timeout = timeout
         return next(self._batches, None)
-
-    def now(self) -> int | None:
-        """Return None: a recording has no clock."""
-        return None
 
     def close(self) -> None:
         """Close the open file."""

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import re
 from functools import lru_cache
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import numpy as np
 
@@ -117,7 +117,7 @@ def _registry() -> pint.UnitRegistry:
     return pint.UnitRegistry(cache_folder=None)
 
 
-def _unit(text: str) -> Any:
+def _unit(text: str) -> pint.Unit:
     """Return a unit of pint's; a temperature within a product is a difference of temperatures.
 
     Raises:
@@ -233,7 +233,6 @@ def _has_dimension(unit: str) -> bool:
 
 _HEADING = re.compile(r".+?\s*[\[(]([^\[\]()]+)[\])]\s*")
 
-
 _ELEMENT = re.compile(r"/\S+\.\S+\[[^\[\]]+\]")
 """Element of a field of a ROS topic, whose name is no unit: /joint_states.position[arm]."""
 
@@ -294,7 +293,7 @@ def spread_factor(given: str | None, wanted: str, where: str, *, squared: bool) 
     return conversion(given, wanted, where)[0]
 
 
-def to_ns(seconds: Any) -> np.ndarray:
+def to_ns(seconds: float | np.ndarray) -> np.ndarray:
     """Return float seconds as int64 nanoseconds.
 
     A float of today's epoch seconds has steps of 238 ns. Loggers write microseconds, which such a float can

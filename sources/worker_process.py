@@ -18,10 +18,11 @@ from collections.abc import Callable, Iterator
 from contextlib import suppress
 from multiprocessing.connection import Connection
 from pathlib import Path
-from typing import Any
+from typing import Any, Generic, TypeVar
 
 from estimators.errors import NisusError, SourceError
 
+T = TypeVar("T")
 ITEM, END, FAULT = range(3)
 """Kinds of answer: an item of the generator, its end, the error that it raised."""
 
@@ -55,13 +56,13 @@ class WorkerProcess:
         self.pid = self._process.pid
         self._write((theirs, list(sys.path)))
 
-    def _write(self, *items: Any) -> None:
+    def _write(self, *items: object) -> None:
         with suppress(BrokenPipeError):  # The end of a worker is reported where its answer is awaited.
             for item in items:
                 pickle.dump(item, self._requests)
             self._requests.flush()
 
-    def submit(self, function: Callable[..., Iterator[Any]], *args: Any) -> None:
+    def submit(self, function: Callable[..., Iterator[object]], *args: object) -> None:
         """Run `function(*args)` after what was asked before; it must be importable by name."""
         # The folder comes first and by itself: a function may be from a folder that was added since.
         self._write((list(sys.path), os.getcwd()), (function, args))
@@ -243,7 +244,7 @@ def _end_idle() -> None:
         _idle.clear()
 
 
-class IsolatedReader:
+class IsolatedReader(Generic[T]):
     """The items of a generator that reads a file in a process of its own.
 
     Args:
@@ -256,9 +257,9 @@ class IsolatedReader:
 
     def __init__(
         self,
-        function: Callable[..., Iterator[Any]],
+        function: Callable[..., Iterator[T]],
         path: Path,
-        *args: Any,
+        *args: object,
         timeout: float | None = None,
         keep: bool = True,
     ) -> None:
@@ -275,7 +276,7 @@ class IsolatedReader:
         """Whether the last item has been taken."""
         return self._worker is None
 
-    def get(self, timeout: float) -> Any:
+    def get(self, timeout: float) -> T | None:
         """Return the next item, or None: at the end (`ended`), or if none came within `timeout` seconds.
 
         Raises:
@@ -346,8 +347,8 @@ def memory_error(path: Path | str, needed: str, limit: int) -> ReaderError:
 
 
 def read_isolated(
-    function: Callable[..., Iterator[Any]], path: Path, *args: Any, timeout: float | None = None
-) -> list[Any]:
+    function: Callable[..., Iterator[T]], path: Path, *args: object, timeout: float | None = None
+) -> list[T]:
     """Return all items of an `IsolatedReader`.
 
     Raises:
@@ -364,7 +365,7 @@ def read_isolated(
     return items
 
 
-def _read(function: Callable[..., Iterator[Any]], path: Path, args: tuple[Any, ...]) -> Iterator[Any]:
+def _read(function: Callable[..., Iterator[T]], path: Path, args: tuple[object, ...]) -> Iterator[T]:
     """In the worker: read a file with limited memory."""
     limit = memory_limit(path)
     os.environ["ARROW_DEFAULT_MEMORY_POOL"] = "system"  # mimalloc would map 1 GiB at its first allocation

@@ -12,9 +12,9 @@ from collections import Counter
 from collections.abc import Callable, Iterable, Iterator, Mapping
 from contextlib import suppress
 from itertools import islice
-from typing import TYPE_CHECKING, Any
 
 import can
+from can import BusABC
 
 from estimators.errors import SourceError
 from estimators.log import Events
@@ -23,7 +23,7 @@ from ..source import LOST_FRAMES, NEVER, Report, ignore
 from ..worker_process import gist
 from .decoder import Decoder, Expected, shown_id
 from .readers import EXTENDED, BusName
-from .sockets import FrameSocket, frame_socket
+from .sockets import FrameSocket, Message, frame_socket
 
 MAX_READ_FRAMES = 4096  # Frames of one read; those queued beyond come with the next
 
@@ -40,7 +40,7 @@ RECONNECT_WAITS_S = (0.1, 0.2, 0.5, 1.0, 2.0, 5.0)
 """Seconds before each attempt to open a bus again; the last one repeats."""
 
 
-def open_bus(interface: str, channel: str | int, options: Mapping[str, Any], filters: list | None = None) -> Any:
+def open_bus(interface: str, channel: str | int, options: Mapping[str, object], filters: list | None = None) -> BusABC:
     """Open a bus through python-can.
 
     Raises:
@@ -63,7 +63,7 @@ def open_bus(interface: str, channel: str | int, options: Mapping[str, Any], fil
         ) from None
 
 
-def _keep_own_group(bus: Any) -> None:
+def _keep_own_group(bus: BusABC) -> None:
     """Restrict a multicast bus to the frames of its own group.
 
     python-can binds its socket to the port alone. Linux then delivers the frames of every group that any process of the
@@ -100,9 +100,9 @@ class CanBus:
         channel: str | int,
         decoder: Decoder,
         *,
-        bus_options: Mapping[str, Any] | None = None,
+        bus_options: Mapping[str, object] | None = None,
         report: Report = ignore,
-        connect: Callable[[], Any] | None = None,
+        connect: Callable[[], BusABC] | None = None,
         clock: Callable[[], float] = time.monotonic,
     ) -> None:
         self._name = f"{interface}:{channel}"
@@ -117,7 +117,7 @@ class CanBus:
         self._attempts = 0
         self._next_attempt = 0.0
         self._failed_before = False
-        self._bus: Any = None
+        self._bus: BusABC | None = None
         self._socket: FrameSocket | None = None
         self._open()
         self._monitor = MessageMonitor(f"CAN bus {self._name}", decoder, clock, report)
@@ -129,7 +129,7 @@ class CanBus:
             return None
         if self._bus is None and not self._reconnect(timeout):
             return Events.empty(self._decoder.width)
-        messages: list[Any] = []
+        messages: list[Message] = []
         arrivals: list[int] = []
         try:
             for message in islice(self._frames(timeout), MAX_READ_FRAMES):
@@ -151,12 +151,12 @@ class CanBus:
         self._bus = self._connect()
         self._socket = frame_socket(self._interface, self._bus)
 
-    def _frames(self, timeout: float) -> Iterator[Any]:
+    def _frames(self, timeout: float) -> Iterator[Message]:
         """Return the queued frames; wait up to `timeout` seconds for the first."""
         if self._socket is not None:
             yield from self._socket.frames(timeout)
             return
-        bus = self._bus
+        bus: BusABC = self._bus
         while (message := bus.recv(timeout)) is not None:
             yield message
             timeout = 0
@@ -211,7 +211,7 @@ class CanBus:
         self._shut()
 
 
-def dropped_frames(bus: Any) -> int | None:
+def dropped_frames(bus: BusABC) -> int | None:
     """Return the frames that the bus's socket has lost since it was opened, as its buffer was full; None if unknown.
 
     The kernel's counter is read as an option of the socket: with SO_RXQ_OVFL it would come with each frame, and
@@ -230,10 +230,10 @@ class SocketLoss:
     def __init__(self, name: str, clock: Callable[[], float], report: Report) -> None:
         """Start now; `name` begins each line, `clock` gives seconds."""
         self._name, self._clock, self._report = name, clock, report
-        self._bus: Any = None
+        self._bus: BusABC | None = None
         self._received, self._before, self._total, self._next = 0, 0, 0, 0.0
 
-    def note(self, bus: Any, received: int) -> None:
+    def note(self, bus: BusABC | None, received: int) -> None:
         """Count frames received from a bus, and look at those it lost when their time has come."""
         now = self._clock()
         if bus is not self._bus:
@@ -256,9 +256,6 @@ class SocketLoss:
         self._before, self._received = count or 0, 0
 
 
-if TYPE_CHECKING:
-    from .decoder import Decoder
-
 MISSING_AFTER_S = 5.0
 MISSING_PERIODS = 3.0
 """Seconds, or periods of the message if they are longer, after which a message is reported as never received."""
@@ -279,7 +276,7 @@ class MessageMonitor:
         self._silence_reported = False
         self._done = False
 
-    def note(self, messages: Iterable[Any]) -> None:
+    def note(self, messages: Iterable[Message]) -> None:
         """Count the messages since the last call, which may be none."""
         if self._done:
             return
@@ -303,16 +300,14 @@ class MessageMonitor:
                 self._silence_reported = True
                 self._report(NEVER, self._silence(waiting))
             return
-        left = False
         for item in waiting:
             texts = self._decoder.missing(item, self._seen, least=MIN_MULTIPLEXED_FRAMES)
             if not texts or waited < MISSING_PERIODS * item.period:
-                left = True
                 continue
             self._reported.add(item.key)
             for text in texts:
                 self._report(NEVER, f"{self._name}: after {waited:.0f} s {text}")
-        self._done = not left
+        self._done = all(item.key in self._reported for item in waiting)
 
     def _silence(self, waiting: list[Expected]) -> str:
         named = ", ".join(f"{item.name} ({shown_id(item.key)})" for item in waiting[:4])

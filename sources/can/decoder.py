@@ -6,10 +6,11 @@ import logging
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from functools import lru_cache
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import cantools
 import numpy as np
+from cantools.database.can import Database, Message, Signal
 
 from estimators.errors import SourceError, nearest
 from estimators.log import READING, Events
@@ -18,6 +19,7 @@ from ..mapping import ABSENT, PRESENT, SHORT, ChannelMapping
 from ..source import Channel, Report, ignore
 from ..units import declared_conversion, second_ns
 from ..worker_process import gist
+from . import sockets
 from .limits import SignalLimits, span_of
 from .readers import EXTENDED, BusName, Raw
 from .signals import extract, ordered, tabulate, vectorises
@@ -56,12 +58,11 @@ class Decoder:
     ) -> None:
         self._report = report
         self.width = width
-        found = [(Path(path), bus) for path, bus in databases]
-        for path, _ in found:
+        for path, _ in databases:
             load_database(path)
-        grouped: dict[int, tuple[Any, BusName, Path, list[Channel]]] = {}
+        grouped: dict[int, tuple[Message, BusName, Path, list[Channel]]] = {}
         for channel in channels:
-            messages, bus, path = find_messages(found, channel)
+            messages, bus, path = find_messages(databases, channel)
             for message in messages:
                 grouped.setdefault(id(message), (message, bus, path, []))[3].append(channel)
         self._plans = list(grouped.values())
@@ -105,7 +106,7 @@ class Decoder:
                     )
 
     @property
-    def filters(self) -> list[dict[str, Any]]:
+    def filters(self) -> list[dict[str, int]]:
         """Filters of python-can for the wanted ids."""
         return [
             {
@@ -165,8 +166,8 @@ class Decoder:
         t = raw.t[rows]
         return Frames(t, t, plan[rows], raw.length[rows], raw.data[rows])
 
-    def gather(self, messages: Sequence[Any], arrivals: Sequence[int] | None) -> Frames:
-        """Return the wanted messages of python-can as arrays; `arrivals` (ns) None takes the frames' own times.
+    def gather(self, messages: Sequence[sockets.Message], arrivals: Sequence[int]) -> Frames:
+        """Return the wanted messages of python-can, which came at `arrivals` (ns), as arrays.
 
         Error and remote frames carry no data and are left out.
         """
@@ -181,19 +182,13 @@ class Decoder:
                 continue
             plan.append(which)
             t.append(second_ns(message.timestamp))
-            if arrivals is not None:
-                arrival.append(arrivals[k])
+            arrival.append(arrivals[k])
             data = bytes(message.data[:longest])
             length.append(len(data))
             chunks.append(data.ljust(longest, b"\0"))
-        times = np.array(t, np.int64)
-        return Frames(
-            times,
-            times if arrivals is None else np.array(arrival, np.int64),
-            np.array(plan, np.int64),
-            np.array(length, np.int64),
-            np.frombuffer(bytearray().join(chunks), np.uint8).reshape(len(chunks), longest),
-        )
+        numbers = (np.array(column, np.int64) for column in (t, arrival, plan, length))
+        rows = np.frombuffer(bytearray().join(chunks), np.uint8).reshape(len(chunks), longest)
+        return Frames._make((*numbers, rows))
 
     def decode(self, frames: Frames) -> Events:
         """Return the events of frames, in their order; the same for live frames and a recording."""
@@ -229,7 +224,7 @@ class Decoder:
             state[i, j] = missing if value is None else PRESENT
 
     @staticmethod
-    def _excluded(message: Any, name: str, found: dict[str, Any]) -> bool:
+    def _excluded(message: Message, name: str, found: dict[str, float]) -> bool:
         """Return whether a multiplexer excludes the signal from the frame."""
         signal = message.get_signal_by_name(name)
         while signal.multiplexer_signal is not None:
@@ -310,7 +305,7 @@ def _list(buses: Sequence[BusName]) -> str:
     return shown + (", ..." if len(buses) > MAX_NAMED_IDS else "")
 
 
-def load_database(path: Path) -> Any:
+def load_database(path: Path) -> Database:
     """Load a database file (DBC, or any other that cantools reads), cached while the file is unchanged.
 
     Raises:
@@ -324,7 +319,7 @@ def load_database(path: Path) -> Any:
 
 
 @lru_cache(maxsize=16)
-def _load(path: Path, stamp: int) -> Any:
+def _load(path: Path, stamp: int) -> Database:
     logger = logging.getLogger("cantools")
     level = logger.level
     logger.setLevel(logging.ERROR)  # It warns of duplicate names, which are harmless.
@@ -335,7 +330,7 @@ def _load(path: Path, stamp: int) -> Any:
         raise SourceError(f"{path}: it cannot be read as a DBC ({gist(error)}); check that it is one") from None
     finally:
         logger.setLevel(level)
-    if not isinstance(database, cantools.database.can.Database):
+    if not isinstance(database, Database):
         raise SourceError(f"{path}: it describes no CAN messages; give a DBC")
     protocol = database.dbc.attributes.get("ProtocolType") if database.dbc is not None else None
     if protocol is not None and protocol.value == "J1939" and "VFrameFormat" not in database.dbc.attribute_definitions:
@@ -355,7 +350,7 @@ def same_bus(wanted: BusName, actual: BusName) -> bool:
     return digits != "" and int(digits) == number
 
 
-def find_messages(databases: list[tuple[Path, BusName]], channel: Channel) -> tuple[list[Any], BusName, Path]:
+def find_messages(databases: Sequence[tuple[Path, BusName]], channel: Channel) -> tuple[list[Message], BusName, Path]:
     """Return the messages that carry a channel, with bus and path of the first database that has them.
 
     There are several if a DBC gives one name to messages of different ids (two devices of a kind).
@@ -394,7 +389,7 @@ def ends_of(databases: list[tuple[Path, BusName]], channel: Channel) -> tuple[tu
     return tuple(tuple(slope * end + shift for end in span_of(signal)[:2]) for signal, slope, shift in found)
 
 
-def slopes(message: Any, channel: Channel) -> Iterator[tuple[Any, float, float]]:
+def slopes(message: Message, channel: Channel) -> Iterator[tuple[Signal, float, float]]:
     """Yield each signal of a channel with slope and shift of its conversion to the model's unit.
 
     Raises:

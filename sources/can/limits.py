@@ -4,9 +4,9 @@ from __future__ import annotations
 
 import re
 from collections.abc import Iterator
-from typing import Any
 
 import numpy as np
+from cantools.database.can import Message, Signal
 
 from ..source import Channel, Report
 
@@ -31,7 +31,9 @@ class SignalLimits:
     feed; signals of conditions keep their values. `report` receives each missing value.
     """
 
-    def __init__(self, plans: list[tuple[Any, list[Any]]], channels: list[list[Channel]], report: Report) -> None:
+    def __init__(
+        self, plans: list[tuple[Message, list[Signal]]], channels: list[list[Channel]], report: Report
+    ) -> None:
         self._messages, self._report = plans, report
         self._rules = [
             [list(_rules(message, one)) if any(one.name in c.measured for c in own) else [] for one in signals]
@@ -57,7 +59,7 @@ class SignalLimits:
             values[i, j] = np.nan
 
 
-def span_of(signal: Any) -> tuple[float, float, bool]:
+def span_of(signal: Signal) -> tuple[float, float, bool]:
     """Return the lowest and highest value of a signal (cantools), and whether these are by the limits of the DBC.
 
     Otherwise they are those that its bits can express.
@@ -73,7 +75,7 @@ def span_of(signal: Any) -> tuple[float, float, bool]:
     return least, most, False
 
 
-def _rules(message: Any, signal: Any) -> Iterator[tuple[float, float, str]]:
+def _rules(message: Message, signal: Signal) -> Iterator[tuple[float, float, str]]:
     """Yield intervals of missing values of a signal with their reasons; of those that overlap the last one counts."""
     scale, offset, bits = float(signal.conversion.scale), float(signal.conversion.offset), signal.length
     slack = 0.0 if signal.is_float else 0.5 * abs(scale)

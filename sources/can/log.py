@@ -54,7 +54,8 @@ class CanLog(Recorded):
     @cached_property
     def span(self) -> tuple[int, int] | None:
         """First and last time, ns; None if the format does not store them."""
-        return log_span(self._files)
+        first, last = _span(self._files[0]), _span(self._files[-1])
+        return None if first is None or last is None or last[1] < first[0] else (first[0], last[1])
 
     def _all(self) -> Generator[Events, None, None]:
         for path in self._files:
@@ -122,12 +123,6 @@ def check_log(path: Path) -> None:
 
 SPAN_TIMEOUT_S = 5.0  # Seconds to wait for the span, which only draws a slider
 TAIL_BYTES = 4096  # Bytes at the end of a text log that hold its last lines
-
-
-def log_span(files: list[Path]) -> tuple[int, int] | None:
-    """Return first and last time of consecutive logs, ns; None if the format does not store them."""
-    first, last = _span(files[0]), _span(files[-1])
-    return None if first is None or last is None or last[1] < first[0] else (first[0], last[1])
 
 
 def _span(path: Path) -> tuple[int, int] | None:

@@ -16,12 +16,16 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from io import BytesIO
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING
 
 import numpy as np
 
 from ..worker_process import gist
 from .readers import CHUNK_FRAMES, EXTENDED, BusName, LogSummary, Raw, unreadable
+
+if TYPE_CHECKING:
+    from asammdf import MDF, Signal
+    from asammdf.blocks.mdf_v4 import Group
 
 
 @contextmanager
@@ -38,7 +42,7 @@ def _quiet() -> Iterator[None]:
         logger.setLevel(level)
 
 
-def _open(path: Path) -> tuple[Any, BytesIO]:
+def _open(path: Path) -> tuple[MDF, BytesIO]:
     from asammdf import MDF  # Here, not above: it takes long, and most logs have other formats.
 
     # From memory: asammdf completes an unfinished file (a logger that lost power) in place.
@@ -89,13 +93,13 @@ def mf4_span(path: Path) -> Iterator[tuple[int, int]]:
         yield start + round(min(ends) * 1e9), start + round(max(ends) * 1e9)
 
 
-def _start(mdf: Any) -> int:
+def _start(mdf: MDF) -> int:
     """Return the start of the file's clock, ns: start_time has the zone, abs_time the fraction of the second."""
     return int(mdf.header.start_time.timestamp() // 1) * 1_000_000_000 + int(mdf.header.abs_time) % 1_000_000_000
 
 
 def _read(
-    path: Path, mdf: Any, content: BytesIO, wanted: frozenset[int] | None, longest: int
+    path: Path, mdf: MDF, content: BytesIO, wanted: frozenset[int] | None, longest: int
 ) -> Iterator[Raw | LogSummary]:
     start = _start(mdf)
     parts: list[tuple[np.ndarray, ...]] = []
@@ -148,7 +152,7 @@ NO_BUS = -1
 """Number of the bus of a group without bus numbers."""
 
 
-def _columns(signal: Any, start: int, wanted: frozenset[int] | None, longest: int) -> tuple[np.ndarray, ...]:
+def _columns(signal: Signal, start: int, wanted: frozenset[int] | None, longest: int) -> tuple[np.ndarray, ...]:
     """Return bus and id of all frames of a group as one number, and the columns of the wanted frames as in `Raw`."""
 
     def column(name: str) -> np.ndarray | None:
@@ -183,14 +187,14 @@ VLSD = 1  # Flag of a channel group whose records are of varying length
 _HEADER = struct.Struct("<4sIQQ")
 
 
-def lost_records(mdf: Any, content: Any) -> str:
+def lost_records(mdf: MDF, content: bytes) -> str:
     """Describe the records of an opened file that were not read; empty if there are none.
 
     Args:
         mdf: asammdf's file, opened.
         content: Its bytes, as asammdf completed them.
     """
-    groups: dict[int, list[Any]] = {}
+    groups: dict[int, list[Group]] = {}
     for group in mdf.groups:
         groups.setdefault(int(group.data_group.address), []).append(group)
     if mdf.version < "4":
@@ -198,7 +202,7 @@ def lost_records(mdf: Any, content: Any) -> str:
     lost = kept = records = 0
     for members in groups.values():
         data = members[0].data_group
-        if any(group.channel_group.flags & VLSD and _has_data(group) for group in members):
+        if any(group.channel_group.flags & VLSD and any(group.signal_data or ()) for group in members):
             continue  # Only the records themselves hold their lengths.
         try:
             promised = _size(content, int(data.data_block_addr), set())
@@ -220,19 +224,7 @@ def lost_records(mdf: Any, content: Any) -> str:
     return f"{lost} of {kept + lost} bytes of records{about} were not read"
 
 
-def _has_data(group: Any) -> bool:
-    return any(bool(blocks) for blocks in (group.signal_data or ()))
-
-
-def _block(content: Any, address: int) -> tuple[bytes, int, tuple[int, ...]]:
-    """Return a block's name, its length, and the addresses of its links."""
-    name, _, length, links = _HEADER.unpack_from(content, address)
-    if links > len(content) // 8:
-        raise ValueError(f"the block at {address:#x} has {links} links")
-    return name, length, struct.unpack_from(f"<{links}Q", content, address + _HEADER.size)
-
-
-def _size(content: Any, address: int, seen: set[int]) -> int | None:
+def _size(content: bytes, address: int, seen: set[int]) -> int | None:
     """Return the bytes of records in a data block, or in a list of them; None if they are stored by column."""
     total = 0
     waiting = [address]
@@ -243,7 +235,10 @@ def _size(content: Any, address: int, seen: set[int]) -> int | None:
         if address in seen:
             raise ValueError(f"the block at {address:#x} is linked to twice")
         seen.add(address)
-        name, length, links = _block(content, address)
+        name, _, length, count = _HEADER.unpack_from(content, address)
+        if count > len(content) // 8:
+            raise ValueError(f"the block at {address:#x} has {count} links")
+        links = struct.unpack_from(f"<{count}Q", content, address + _HEADER.size)
         if name == b"##DT":
             total += length - _HEADER.size
         elif name == b"##DZ":

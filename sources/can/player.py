@@ -7,9 +7,9 @@ import threading
 import time
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from pathlib import Path
-from typing import Any
 
 import can
+from cantools.database.can import Message
 
 from estimators.errors import SourceError
 from estimators.log import INPUT, READING, TRUTH, Events
@@ -19,7 +19,7 @@ from .bus import open_bus
 from .decoder import BusName, find_messages, slopes
 from .limits import span_of
 
-INPUT_REPEAT_NS = 1_000_000_000  # ns after which an unchanged input is sent again
+INPUT_REPEAT_NS = 1_000_000_000  # ns after which an unchanged input is sent again, for listeners that joined later
 
 MAX_DELAY_NS = 1_000_000_000
 """ns of delay (the process was suspended) beyond which time is skipped instead of sending a burst of frames."""
@@ -53,9 +53,9 @@ class Player:
         *,
         interface: str,
         channel: str | int,
-        bus_options: Mapping[str, Any] | None = None,
+        bus_options: Mapping[str, object] | None = None,
         report: Report = ignore,
-        connect: Callable[[], Any] | None = None,
+        connect: Callable[[], can.BusABC] | None = None,
         clock: Callable[[], int] = time.monotonic_ns,
     ) -> None:
         self._source = source
@@ -125,7 +125,7 @@ class Player:
         return moments
 
     def _send(self, t: int, events: list[tuple[int, int, Sequence[float]]]) -> None:
-        for frame in self._encoder.frames(t, events, INPUT_REPEAT_NS):
+        for frame in self._encoder.frames(t, events):
             try:
                 frame.timestamp = time.time()
                 self._bus.send(frame)
@@ -140,7 +140,7 @@ class Player:
 class _Frame:
     """A message and its current values."""
 
-    def __init__(self, message: Any) -> None:
+    def __init__(self, message: Message) -> None:
         self.message = message
         self.values: dict[str, float] = {}
         for signal in message.signals:
@@ -180,7 +180,6 @@ class Encoder:
         self._frames: dict[str, _Frame] = {}
         # By an event's kind and index: its frame and, for each row, signal, slope, offset and range of the conversion.
         self._routes: dict[tuple[int, int], tuple[_Frame, list[tuple[str, float, float, float, float]]]] = {}
-        found = [(Path(path), bus) for path, bus in databases]
         for channel in channels:
             if channel.convert is not None:
                 raise SourceError(
@@ -192,7 +191,7 @@ class Encoder:
                 raise SourceError(
                     f"{channel.name}: accuracy comes from the asset; it cannot be encoded, so leave it out"
                 )
-            messages, _, path = find_messages(found, channel)
+            messages, _, path = find_messages(databases, channel)
             message = messages[0]
             if any(signal.multiplexer_ids for signal in message.signals):
                 raise SourceError(f"{path.name}: message {message.name} is multiplexed; it cannot be encoded")
@@ -224,13 +223,12 @@ class Encoder:
                 frame.known.add(name)
         return frame
 
-    def frames(self, t: int, events: Sequence[tuple[int, int, Sequence[float]]], repeat: int) -> list[can.Message]:
+    def frames(self, t: int, events: Sequence[tuple[int, int, Sequence[float]]]) -> list[can.Message]:
         """Return the frames of the events of one time: (kind, index, values), inputs and true states one by one.
 
         Args:
             t: Time of the events, ns.
             events: The events.
-            repeat: ns after which an unchanged input is sent again, for listeners that joined later.
         """
         touched: dict[int, _Frame] = {}
         for kind, index, values in events:
@@ -238,7 +236,7 @@ class Encoder:
             if frame is not None and (kind == READING or not frame.reads):
                 touched[id(frame)] = frame
         for (kind, _), (frame, _) in self._routes.items():
-            if kind == INPUT and not frame.reads and (frame.sent_at is None or t - frame.sent_at >= repeat):
+            if kind == INPUT and not frame.reads and (frame.sent_at is None or t - frame.sent_at >= INPUT_REPEAT_NS):
                 touched[id(frame)] = frame
         out = []
         for frame in touched.values():

@@ -13,9 +13,11 @@ from contextlib import suppress
 from io import TextIOWrapper
 from itertools import islice
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
+import can
 import numpy as np
+from can.io import asc, blf
 
 from estimators.errors import SourceError
 
@@ -28,14 +30,12 @@ MAX_TIME_S = 2.0**62 / 1e9  # Distance of a valid time from 1970, s
 MAX_BAD_LINES = 100  # Lines of a text log that cannot be read, one after the other, after which the rest is left
 
 
-def open_reader(path: Path) -> Any:
+def open_reader(path: Path) -> can.io.MessageReader:
     """Open a file with the reader of python-can.
 
     Raises:
         SourceError: If it is not of the format of its name.
     """
-    import can
-
     try:
         return can.LogReader(path)
     except Exception as error:  # noqa: BLE001  a damaged file makes python-can's readers raise anything
@@ -53,8 +53,6 @@ def read_messages(path: Path, wanted: frozenset[int] | None, longest: int) -> It
     Raises:
         SourceError: If nothing can be read.
     """
-    import can
-
     from .blf import BlfBlocks
 
     _correct_readers()
@@ -74,13 +72,13 @@ def read_messages(path: Path, wanted: frozenset[int] | None, longest: int) -> It
         messages = _by_lines(path, reader, lines) if lines else iter(reader)
         size = FIRST_CHUNK_FRAMES
         while True:
-            chunk: list[Any] = []
+            chunk: list[can.Message] = []
             block: Raw | None = None
             try:
                 # One by one, so that frames before the fault are kept.
                 for message in islice(messages, size):
-                    if isinstance(message, tuple):
-                        block = Raw(*message)
+                    if isinstance(message, Raw):
+                        block = message
                         break
                     chunk.append(message)
             except SourceError:
@@ -120,8 +118,6 @@ def _correct_readers() -> None:
     frame of which a BLF log holds fewer bytes than it counts is filled with zeros, or with the next frame
     (hardbyte/python-can#1905). Lines of an ASC log before its start are skipped (hardbyte/python-can#1595).
     """
-    from can.io import asc, blf
-
     blf.OBJ_HEADER_V1_STRUCT = struct.Struct("<LHHq")
     blf.OBJ_HEADER_V2_STRUCT = struct.Struct("<LBxHq8x")
     if isinstance(blf.CAN_FD_MSG_STRUCT, struct.Struct):
@@ -148,10 +144,8 @@ class _StoredBytes:
         self.size, self.pack = layout.size, layout.pack
         self._layout, self._head, self._count, self._end = layout, head, count, end
 
-    def unpack_from(self, data: bytes, at: int) -> tuple[Any, ...]:
+    def unpack_from(self, data: bytes, at: int) -> tuple[object, ...]:
         """Return the fields of an object whose header ends at a place."""
-        from can.io import blf
-
         fields = list(self._layout.unpack(data[at : at + self.size].ljust(self.size, b"\0")))
         header = 32 if data[at - 32 : at - 28] == b"LOBJ" else 40
         *_, size, _ = blf.OBJ_HEADER_BASE_STRUCT.unpack_from(data, at - header)
@@ -207,7 +201,7 @@ def refused(before: str, count: int, what: str, place: str, error: object) -> st
     return f"{count} {what}{'s' if count > 1 else ''} cannot be read, the first{first}"
 
 
-def _by_lines(path: Path, reader: Any, lines: _Lines) -> Iterator[Any]:
+def _by_lines(path: Path, reader: can.io.MessageReader, lines: _Lines) -> Iterator[can.Message]:
     """Yield the messages of a text log; a line that cannot be read is counted and skipped.
 
     Raises:
@@ -256,7 +250,7 @@ class _Warnings(logging.Handler):
 
 
 def _columns(
-    messages: list[Any],
+    messages: list[can.Message],
     wanted: frozenset[int] | None,
     longest: int,
     buses: dict[BusName, int],
@@ -319,10 +313,8 @@ def _selected(
     return Raw(block.t[rows], block.key[rows], places[inverse], length, data, tuple(buses), block.total)
 
 
-def _missing_end(path: Path, reader: Any) -> str:
+def _missing_end(path: Path, reader: can.io.MessageReader) -> str:
     """Return why a file that was read without a fault is incomplete, or an empty text."""
-    import can
-
     if isinstance(reader, can.BLFReader):
         size = path.stat().st_size
         if reader.file_size > size:

@@ -6,7 +6,7 @@ The same loop serves a live bus, a few frames at a time, and recordings, thousan
 from __future__ import annotations
 
 from types import SimpleNamespace
-from typing import Any, NamedTuple
+from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 from numba import types
@@ -14,6 +14,9 @@ from numba import types
 from estimators.numerics.jit import B1, F1, F2, I1, jit
 
 from ..mapping import ABSENT, PRESENT, SHORT
+
+if TYPE_CHECKING:
+    from cantools.database.can import Message, Signal
 
 UNSIGNED, SIGNED, FLOAT32, FLOAT64 = range(4)
 
@@ -49,7 +52,7 @@ extract_signature = types.void(
 
 
 @jit
-def _bits(data: Any, i: int, start: int, length: int, big: bool) -> Any:
+def _bits(data: np.ndarray, i: int, start: int, length: int, big: bool) -> np.uint64:
     """Return `length` bits of frame i as an unsigned integer."""
     raw = np.uint64(0)
     got = 0
@@ -142,14 +145,7 @@ def extract(signals, plan, length, data, values, state, bad):
                     bad[i] = 1
 
 
-def _network_start(signal: Any) -> int:
-    """Return the number of bits before the signal's first one, in the order in which its bytes are read."""
-    if signal.byte_order == "little_endian":
-        return int(signal.start)
-    return 8 * (int(signal.start) // 8) + (7 - int(signal.start) % 8)
-
-
-def vectorises(signal: Any) -> bool:
+def vectorises(signal: Signal) -> bool:
     """Return whether `extract` gives the values of cantools; otherwise cantools decodes the message, frame by frame."""
     conversion = signal.conversion
     whole = float(conversion.scale).is_integer() and float(conversion.offset).is_integer()
@@ -162,10 +158,10 @@ def vectorises(signal: Any) -> bool:
     return identity or not whole or signal.length + int(abs(conversion.scale)).bit_length() <= 52
 
 
-def ordered(message: Any, names: tuple[str, ...]) -> list[Any]:
+def ordered(message: Message, names: tuple[str, ...]) -> list[Signal]:
     """Return the signals of these names and their multiplexers, each multiplexer before the signals that it selects."""
     by_name = {signal.name: signal for signal in message.signals}
-    found: dict[str, Any] = {}
+    found: dict[str, Signal] = {}
 
     def visit(name: str) -> None:
         signal = by_name[name]
@@ -178,8 +174,10 @@ def ordered(message: Any, names: tuple[str, ...]) -> list[Any]:
     return list(found.values())
 
 
-def tabulate(messages: list[tuple[Any, list[Any]]]) -> Signals:
+def tabulate(messages: list[tuple[Message, list[Signal]]]) -> Signals:
     """Return the tables of messages (cantools) and their wanted signals, in the order of `ordered`."""
+    from cantools.database.utils import start_bit  # Here, not above: processes that compile have no signals.
+
     tables = SimpleNamespace(**{name: [] for name in Signals._fields})
     for starts in (tables.first, tables.ids_first, tables.known_first):
         starts.append(0)
@@ -187,7 +185,7 @@ def tabulate(messages: list[tuple[Any, list[Any]]]) -> Signals:
         names = [signal.name for signal in signals]
         for signal in signals:
             floats = FLOAT32 if signal.length == 32 else FLOAT64
-            tables.start.append(_network_start(signal))
+            tables.start.append(start_bit(signal))
             tables.length.append(signal.length)
             tables.big.append(signal.byte_order != "little_endian")
             tables.kind.append(floats if signal.is_float else SIGNED if signal.is_signed else UNSIGNED)

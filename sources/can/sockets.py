@@ -12,7 +12,7 @@ import socket
 import struct
 import sys
 from collections.abc import Callable, Iterator
-from typing import Any, NamedTuple
+from typing import NamedTuple, TypeAlias
 
 import can
 import msgpack
@@ -52,15 +52,16 @@ class Frame(NamedTuple):
     data: bytes
 
 
-Parse = Callable[[bytes, float, Any], Any]
+Message: TypeAlias = "Frame | can.Message"
+Parse = Callable[[bytes, float, str | tuple[str, ...]], "Message | None"]
 """Return the frame of a packet, its time and its sender's address; None for one that the bus does not deliver."""
 
 
-def socketcan_parser(bus: Any) -> Parse:
+def socketcan_parser(bus: can.BusABC) -> Parse:
     """Return the parser of `struct can_frame` and `struct canfd_frame`."""
     own = bus.channel
 
-    def parse(packet: bytes, timestamp: float, address: Any) -> Frame:
+    def parse(packet: bytes, timestamp: float, address: str | tuple[str, ...]) -> Frame:
         identifier, length = CAN_HEADER.unpack_from(packet)
         extended, remote = bool(identifier & EXTENDED_FLAG), bool(identifier & REMOTE_FLAG)
         return Frame(
@@ -76,13 +77,13 @@ def socketcan_parser(bus: Any) -> Parse:
     return parse
 
 
-def multicast_parser(bus: Any) -> Parse:
+def multicast_parser(bus: can.BusABC) -> Parse:
     """Return the parser of the packets of python-can's UDP multicast."""
     from can.interfaces.udp_multicast.utils import unpack_message
 
     unpack, fd = msgpack.unpackb, bus.protocol is can.CanProtocol.CAN_FD
 
-    def parse(packet: bytes, timestamp: float, _address: Any) -> Any:
+    def parse(packet: bytes, timestamp: float, _address: object) -> Message | None:
         try:
             found = unpack(packet, raw=False)
             key, extended, data, channel = (
@@ -117,14 +118,14 @@ PARSERS = {"socketcan": socketcan_parser, "udp_multicast": multicast_parser}
 class FrameSocket:
     """The socket of an open bus, for reading all frames that it has queued."""
 
-    def __init__(self, bus: Any, parse: Parse) -> None:
+    def __init__(self, bus: can.BusABC, parse: Parse) -> None:
         """Read the socket of `bus` beside it; both are to be closed."""
         self._parse = parse
         self._socket = socket.socket(fileno=os.dup(bus.fileno()))
         self._poll = select.poll()
         self._poll.register(self._socket, select.POLLIN)
 
-    def frames(self, timeout: float) -> Iterator[Any]:
+    def frames(self, timeout: float) -> Iterator[Message]:
         """Yield the queued frames until there are no more; wait up to `timeout` seconds for the first.
 
         Raises:
@@ -151,7 +152,7 @@ class FrameSocket:
         self._socket.close()
 
 
-def frame_socket(interface: str, bus: Any) -> FrameSocket | None:
+def frame_socket(interface: str, bus: can.BusABC) -> FrameSocket | None:
     """Return the socket of a bus; None if its frames come through python-can alone: no Linux, or filters in Python."""
     if sys.platform != "linux" or interface not in PARSERS or (bus.filters and not getattr(bus, "_is_filtered", False)):
         return None

@@ -113,11 +113,9 @@ class Target:
         """Return the unaffected part of an event (other inputs), if there is one, and the affected part."""
         if self.input is None:
             return [], item
-        mine = np.full_like(item.value, np.nan)
-        mine[self.input] = item.value[self.input]
-        rest = item.value.copy()
-        rest[self.input] = np.nan
-        return ([replace(item, value=rest)] if not np.isnan(rest).all() else []), replace(item, value=mine)
+        own = np.arange(item.value.size) == self.input
+        mine, rest = (replace(item, value=np.where(cells, item.value, np.nan)) for cells in (own, ~own))
+        return [] if np.isnan(rest.value).all() else [rest], mine
 
 
 @dataclass(frozen=True)

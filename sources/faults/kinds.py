@@ -190,9 +190,8 @@ def _of_numbers(fault: Fault, kind: FaultKind) -> tuple[str, str] | None:
 
 def numbers(fault: Fault) -> dict[str, float]:
     """Return the numbers of a fault by name, with defaults."""
-    given = {item.name: getattr(fault, item.name) for item in find_kind(fault.kind).parameters}
-    defaults = {item.name: item.default for item in find_kind(fault.kind).parameters}
-    return {name: float(value if value is not None else defaults[name] or 0.0) for name, value in given.items()}
+    given = [(item, getattr(fault, item.name)) for item in find_kind(fault.kind).parameters]
+    return {item.name: float(value if value is not None else item.default or 0.0) for item, value in given}
 
 
 NEVER_NS = 2**62  # Time after any event, ns

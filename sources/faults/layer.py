@@ -318,7 +318,7 @@ class FaultySource:
     def __init__(self, inner: Source, faults: Faults) -> None:
         self.inner, self.faults = inner, faults
         self.live = inner.live
-        self._restarts = self._count_restarts()
+        self._restarts = getattr(inner, "restarts", 0)
 
     @property
     def span(self) -> tuple[int, int] | None:
@@ -330,15 +330,13 @@ class FaultySource:
         """Whether the source inside has no end."""
         return is_endless(self.inner)
 
-    def _count_restarts(self) -> int:
-        return getattr(self.inner, "restarts", 0)
-
     def read(self, timeout: float) -> Events | None:
         """Return the next events and the delayed ones that are due; None at the end."""
         now = self.inner.now()
         batch = self.inner.read(timeout)
-        if self._count_restarts() != self._restarts:
-            self._restarts = self._count_restarts()
+        restarts = getattr(self.inner, "restarts", 0)
+        if restarts != self._restarts:
+            self._restarts = restarts
             self.faults.restart()
         if batch is None:
             rest = self.faults.finish()

@@ -17,7 +17,6 @@ import zipfile
 from collections.abc import Generator, Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 
@@ -45,7 +44,7 @@ def _readable(path: Path, kind: str) -> Iterator[None]:
         raise SourceError(f"{path}: it cannot be read as {kind} ({gist(error)}); check that it is complete") from None
 
 
-def _content(path: Path) -> Any:
+def _content(path: Path) -> Path | io.BytesIO:
     """Return what a library that seeks can read: the path, or the decompressed bytes."""
     if not is_compressed(path):
         return path
@@ -149,7 +148,7 @@ def _vectors(path: Path) -> dict[str, np.ndarray]:
     return found
 
 
-def _collect(name: str, value: Any, found: dict[str, np.ndarray]) -> None:
+def _collect(name: str, value: object, found: dict[str, np.ndarray]) -> None:
     """Add the vectors of numbers in a struct, an array of structs or a vector, under their names."""
     if hasattr(value, "_fieldnames"):
         for field in value._fieldnames:

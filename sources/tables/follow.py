@@ -10,7 +10,7 @@ import zlib
 from collections import deque
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import suppress
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, BinaryIO
 
@@ -21,7 +21,7 @@ from estimators.log import Events
 
 from ..formats import is_compressed, suffix_of
 from ..mapping import ABSENT, PRESENT
-from ..source import NEVER, NO_ASSET, TRUNCATED, AssetEvents, Channel, Report, ignore
+from ..source import NEVER, NO_ASSET, TRUNCATED, AssetEvents, Channel, Report, Source, ignore
 from .rows import TableRows, dated, is_text, names_of, rows_of
 from .table import mapped
 from .text import HEAD_BYTES, UNREADABLE, Column, CsvFormat, TextCodes, chunk_of, column_of, format_of
@@ -41,6 +41,8 @@ LEFT_OUT = "file left out"
 
 PARQUET_END = b"PAR1"
 """Last bytes of a complete Parquet file."""
+
+_Batch = Events | AssetEvents
 
 
 @dataclass
@@ -63,26 +65,13 @@ class _File:
     times: TimeReader | None = None
     rows: Iterator[TableRows | None] | None = None
 
-    def state(self) -> list[int]:
-        """Return the position for the store."""
-        return [self.offset, self.line, self.checked, self.head]
-
     def is_same(self, file: BinaryIO, size: int) -> bool:
         """Return whether a file of this inode still begins as it did."""
         file.seek(0)
         return size >= self.offset and zlib.crc32(file.read(self.checked)) == self.head
 
 
-@dataclass
-class _Stored:
-    """Positions by inode that the store has, and later ones with the mark of each; None of a file that is gone."""
-
-    on: bool = False
-    positions: dict[int, list[int]] = field(default_factory=dict)
-    later: deque[tuple[int, int, list[int] | None]] = field(default_factory=deque)
-
-
-class FollowedTable:
+class FollowedTable(Source):
     """Reads the new rows of tables, in the order of their names: of plain CSV files as they are written.
 
     A file is known by its inode and first bytes, so one that is renamed is not read again, and one that is truncated or
@@ -125,11 +114,13 @@ class FollowedTable:
         self._fed = {name: channel.name for channel in channels for name in channel.needed}
         self._valueless = set(range(len(self._columns)))
         nothing = Events.empty(width)
-        self._nothing = nothing if asset is None else AssetEvents(nothing, np.zeros(0, np.int64), ())
+        self._nothing: _Batch = nothing if asset is None else AssetEvents(nothing, np.zeros(0, np.int64), ())
         self._files: dict[int, _File] = {}
         self._open: tuple[int, Path, BinaryIO] | None = None
         """Inode, path and handle of the file that was read last; if it was moved away, its rest is read from here."""
-        self._stored = _Stored()
+        self._stores, self._stored = False, dict[int, list[int]]()
+        self._unstored: deque[tuple[int, int, list[int] | None]] = deque()
+        """Mark, inode and position of what is not in `_stored` yet, by inode; None of a file that is gone."""
         self._closing = threading.Event()
         self.mark = 0
         """Pieces that were read."""
@@ -144,19 +135,18 @@ class FollowedTable:
 
     def numbers(self, mark: int) -> dict[str, list[int]]:
         """Return the positions after the first `mark` pieces, for `restore`."""
-        stored = self._stored
-        while stored.later and stored.later[0][0] <= mark:
-            _, inode, state = stored.later.popleft()
+        while self._unstored and self._unstored[0][0] <= mark:
+            _, inode, state = self._unstored.popleft()
             if state is None:
-                stored.positions.pop(inode, None)
+                self._stored.pop(inode, None)
             else:
-                stored.positions[inode] = state
-        return {str(inode): state for inode, state in stored.positions.items()}
+                self._stored[inode] = state
+        return {str(inode): state for inode, state in self._stored.items()}
 
     def restore(self, numbers: Mapping[str, Any]) -> None:
         """Continue at the `numbers` of the source before a restart, if any, and keep them from now on."""
-        self._stored = _Stored(True, {int(inode): [*map(int, state)] for inode, state in numbers.items()})
-        for inode, (offset, line, checked, head) in self._stored.positions.items():
+        self._stores, self._stored = True, {int(inode): [*map(int, state)] for inode, state in numbers.items()}
+        for inode, (offset, line, checked, head) in self._stored.items():
             self._files[inode] = _File(inode, offset, line, checked, head)
 
     def read(self, timeout: float) -> Any:
@@ -174,10 +164,6 @@ class FollowedTable:
             events = self._next()
         return self._nothing if events is None else events
 
-    def now(self) -> int | None:
-        """Return None: files have no clock."""
-        return None
-
     def close(self) -> None:
         """Close the file that is open."""
         self._closing.set()
@@ -186,7 +172,7 @@ class FollowedTable:
             if file.rows is not None:
                 file.rows.close()  # type: ignore[attr-defined]
 
-    def _next(self) -> Any:
+    def _next(self) -> _Batch | None:
         """Return the events of the next piece of the first file that has one; None if there is none."""
         present: list[tuple[Path, os.stat_result]] = []
         try:
@@ -230,7 +216,7 @@ class FollowedTable:
             self._open[2].close()
         self._open = None
 
-    def _of(self, path: Path) -> Any:
+    def _of(self, path: Path) -> _Batch | None:
         """Return the events of the next piece of a file; None if it has none."""
         handle = path.open("rb")
         try:
@@ -250,7 +236,7 @@ class FollowedTable:
         self._open = (stat.st_ino, path, handle)
         return events
 
-    def _piece(self, path: Path, handle: BinaryIO, file: _File) -> Any:
+    def _piece(self, path: Path, handle: BinaryIO, file: _File) -> _Batch | None:
         """Return the events of the next complete lines or rows; None if there are none."""
         if not _is_plain(path):
             return self._rows(path, handle, file)
@@ -274,7 +260,7 @@ class FollowedTable:
         self._advance(handle, file, file.offset + end, file.line + len(lines))
         return events
 
-    def _rows(self, path: Path, handle: BinaryIO, file: _File) -> Any:
+    def _rows(self, path: Path, handle: BinaryIO, file: _File) -> _Batch | None:
         """Return the events of the next rows of a file that is no plain CSV; None if there are none."""
         size = os.fstat(handle.fileno()).st_size
         if file.rows is None:
@@ -308,11 +294,11 @@ class FollowedTable:
         handle.seek(0)
         file.head = zlib.crc32(handle.read(file.checked))
         self.mark += 1
-        self._note(file.inode, file.state())
+        self._note(file.inode, [file.offset, file.line, file.checked, file.head])
 
     def _note(self, inode: int, state: list[int] | None) -> None:
-        if self._stored.on:
-            self._stored.later.append((self.mark, inode, state))
+        if self._stores:
+            self._unstored.append((self.mark, inode, state))
 
     def _format(self, path: Path, handle: BinaryIO) -> CsvFormat | None:
         """Return the format of a file, None while its first line is not complete.
@@ -344,7 +330,7 @@ class FollowedTable:
 
     def _events(
         self, path: Path, lines: list[str], before: int, kind: CsvFormat, times: TimeReader, came: int | None
-    ) -> Any:
+    ) -> _Batch:
         """Return the events of the lines that follow so many lines of a file, and `came` at that time, ns."""
         rows, numbers = [], []
         problems: list[tuple[str, int, str]] = []
@@ -368,7 +354,7 @@ class FollowedTable:
             self._report(key, f"{path.name}:{number}: {text}")
         return self._nothing if found is None else self._batch(path, found, came)
 
-    def _batch(self, path: Path, found: TableRows, came: int | None = None) -> Any:
+    def _batch(self, path: Path, found: TableRows, came: int | None = None) -> _Batch:
         """Return the events of rows, which `came` at that time, ns; None if it is not known, as of a recording."""
         for key, number, text in found.problems:
             self._report(key, f"{path.name}:{number}: {text}")

@@ -80,23 +80,15 @@ class Order:
         """Report the rows that are too late, each with the place of the first, and whether the rows were sorted."""
         if not self._late or self._horizon is None:
             return
-        key, text = (
-            BACKWARDS,
-            (
-                f"{self._late}, more than time.horizon ({self._horizon * 1e-9:g} s), which is a lone wrong time or a "
-                f"change of time zone, so the rows are not sorted: correct {self._column}, or give its time.zone"
-            ),
+        text = (
+            f"{self._late}, more than time.horizon ({self._horizon * 1e-9:g} s), which is a lone wrong time or a "
+            f"change of time zone, so the rows are not sorted: correct {self._column}, or give its time.zone"
         )
         if sorted_rows:
-            key, text = (
-                SORTED,
-                (
-                    f"{self._late}; the rows are out of order and were sorted by {self._column}; if its clock was set "
-                    "there, correct it"
-                ),
-            )
+            rule = f"the rows are out of order and were sorted by {self._column}"
+            text = f"{self._late}; {rule}; if its clock was set there, correct it"
         for _ in range(self._late_rows):
-            self._report(key, text)
+            self._report(SORTED if sorted_rows else BACKWARDS, text)
 
     def _backwards(self, file: str, line: np.ndarray, t: np.ndarray) -> None:
         if self._horizon is None:

@@ -160,7 +160,7 @@ def dated(chunk: Chunk, times: TimeReader, time: TimeColumn, problems: list[tupl
     return TableRows(chunk.line, t, known, chunk.values, chunk.blank, (), chunk.words)
 
 
-def _undated(time: TimeColumn, cell: Any) -> str:
+def _undated(time: TimeColumn, cell: object) -> str:
     """Return why a row has no time, and the remedy."""
     text = "" if cell is None else str(cell).strip()
     if text in ("", "None", "nan", "NaT"):

@@ -230,17 +230,6 @@ def column_of(name: Column) -> str:
     return name if isinstance(name, str) else name.column
 
 
-def _number(cell: str) -> float:
-    """Return a cell as a number; `1_000` is one in Python only.
-
-    Raises:
-        ValueError: If it is not a number.
-    """
-    if "_" in cell:
-        raise ValueError(cell)
-    return float(cell)
-
-
 def no_value(name: str, text: str) -> tuple[str, str] | None:
     """Return key and text of the report of a word of quality in place of a value; None of any other text."""
     if not QUALITY_WORD.fullmatch(word := text.strip()):
@@ -273,7 +262,7 @@ def fill(
         pass
     for k, cell in enumerate(cells):
         try:
-            values[k] = _number(texts[k])
+            values[k] = float("?" if "_" in cell else texts[k])  # `1_000` is a number in Python only.
         except ValueError:
             values[k] = np.nan
             if not cell.strip():

@@ -8,7 +8,7 @@ from datetime import UTC, datetime, timedelta
 from decimal import Decimal
 from itertools import islice
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import TYPE_CHECKING, NamedTuple
 from zoneinfo import ZoneInfo
 
 import numpy as np
@@ -16,6 +16,9 @@ import numpy as np
 from estimators.errors import SourceError, quoted
 
 from ..units import to_ns
+
+if TYPE_CHECKING:
+    import pyarrow
 
 DAY_NS = 86_400 * 10**9
 
@@ -106,7 +109,7 @@ class TimeReader:
         self._order: str | None = None
         self._summer = _SummerTime(column, self.notes) if column.zone is not None else None
 
-    def read(self, cells: Any) -> tuple[np.ndarray, np.ndarray]:
+    def read(self, cells: list[str] | pyarrow.Array) -> tuple[np.ndarray, np.ndarray]:
         """Return times (ns), and a mask of the rows that have one.
 
         Args:

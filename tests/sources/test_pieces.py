@@ -15,7 +15,7 @@ from tests.support import read_all
 
 def test_frames_and_rows_run_what_the_pieces_are(tmp_path):
     decoder = decoding(tmp_path, [sensor(0, "ENGINE", "Temp")])
-    assert len(decoder.decode(decoder.gather([frame(256, bytes(8))], None))) == 1
+    assert len(decoder.decode(decoder.gather([frame(256, bytes(8))], [1]))) == 1
     assert len(decoder.decode(decoder.gather([frame(256, bytes(8))] * 3, [1, 2, 3]))) == 3
     assert len(read_all(table(write(tmp_path, HEADER + "0.1,20,1,2,1,3,7\n")))) == 4
     for kernel, signature, name in ((extract, extract_signature, FRAMES), (emit, emit_signature, VALUES)):

@@ -9,6 +9,7 @@ import can
 from estimators.log import READING, Events
 from sources.can.decoder import Decoder
 from sources.source import Channel
+from sources.units import second_ns
 
 DBC = Path(__file__).with_name("plant.dbc").read_text()
 
@@ -34,6 +35,11 @@ def dbc(folder: Path, text: str = DBC, name: str = "test.dbc") -> Path:
 def decoding(folder: Path, channels: list[Channel], width: int = 1, **more: Any) -> Decoder:
     """A decoder of channels of the small DBC."""
     return Decoder([(dbc(folder), None)], channels, width=width, **more)
+
+
+def decoded(decoder: Decoder, messages: list[can.Message]) -> Events:
+    """The events of messages that came at their own times."""
+    return decoder.decode(decoder.gather(messages, [second_ns(message.timestamp) for message in messages]))
 
 
 def sensor(index: int, message: str, *signals: str, **more: Any) -> Channel:

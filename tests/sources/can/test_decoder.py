@@ -10,7 +10,7 @@ from estimators.log import INPUT, READING, TRUTH
 from sources.can.decoder import Decoder, ends_of
 from sources.source import Accuracy, Channel, Condition
 from tests.cases import cases
-from tests.sources.can.can_tools import DBC, Reports, dbc, decoding, frame, sensor
+from tests.sources.can.can_tools import DBC, Reports, dbc, decoded, decoding, frame, sensor
 from tests.support import error_of
 
 
@@ -61,7 +61,7 @@ def test_random_layouts_decode_as_cantools_does(tmp_path, seed):
         can.Message(timestamp=1.0, arbitration_id=k + 16, is_extended_id=False, is_fd=len(data) > 8, data=data)
         for k, data in frames
     ]
-    batch = decoder.decode(decoder.gather(messages, None))
+    batch = decoded(decoder, messages)
     assert batch.channel.tolist() == [k for k, _ in frames]
     for (k, data), row in zip(frames, batch.value, strict=True):
         expected = database.decode_message(k + 16, data, decode_choices=False, allow_truncated=True)
@@ -89,7 +89,7 @@ def test_extended_multiplexing_as_cantools_does(tmp_path):
             refused += 1
             continue
         expected += [(k, found[name]) for k, name in enumerate(("Speed", "Revs", "Code")) if name in found]
-    batch = decoder.decode(decoder.gather(messages, None))
+    batch = decoded(decoder, messages)
     spoken = ~np.isnan(batch.value[:, 0])
     assert list(zip(batch.channel[spoken].tolist(), batch.value[spoken, 0].tolist(), strict=True)) == expected
     assert reports.counts["undecodable frame"] == refused + cut > cut > 0
@@ -100,7 +100,7 @@ def test_extended_multiplexing_as_cantools_does(tmp_path):
 def test_a_signal_behind_the_frames_end_is_missing_and_counted(tmp_path):
     reports = Reports()
     decoder = decoding(tmp_path, [sensor(0, "ENGINE", "Temp", "Torque")], width=2, report=reports)
-    batch = decoder.decode(decoder.gather([frame(256, b"\xf4\x01\x00")], None))
+    batch = decoded(decoder, [frame(256, b"\xf4\x01\x00")])
     assert batch.value[0, 0] == 10.0 and np.isnan(batch.value[0, 1])
     assert reports.counts == {"short frame sensor0": 1}
 
@@ -114,7 +114,7 @@ def test_units_scale_offset_and_conditions(tmp_path):
     decoder = decoding(tmp_path, channels, report=reports)
     good = frame(256, bytes.fromhex("f401 0fa0 0000 0080".replace(" ", "")))
     bad = frame(256, bytes.fromhex("f401 0fa0 0000 0000".replace(" ", "")))
-    batch = decoder.decode(decoder.gather([good, bad], None))
+    batch = decoded(decoder, [good, bad])
     assert batch.channel.tolist() == [0, 1, 0, 1]
     assert batch.value[0, 0] == pytest.approx(-1000 * 2 * np.pi / 60 + 5, rel=1e-14)
     assert batch.value[1, 0] == pytest.approx(283.15, rel=1e-14)
@@ -146,7 +146,8 @@ def test_other_frames_are_rejected_before_decoding(tmp_path):
     error = can.Message(arbitration_id=256, is_extended_id=False, is_error_frame=True)
     remote = can.Message(arbitration_id=256, is_extended_id=False, is_remote_frame=True, dlc=8)
     others = [frame(257, data), frame(256, data, extended=True), frame(512, data), error, remote]
-    frames = decoder.gather([*others, frame(256, data), frame(512, data, extended=True)], None)
+    messages = [*others, frame(256, data), frame(512, data, extended=True)]
+    frames = decoder.gather(messages, range(len(messages)))
     assert frames.plan.size == 2
     assert decoder.decode(frames).channel.tolist() == [0, 1]
 
@@ -158,7 +159,7 @@ def test_a_database_holds_on_its_own_bus(tmp_path):
     decoder = Decoder([(one, 1), (two, 2)], channels, width=1)
     data = bytes.fromhex("f401") + bytes(6)
     messages = [frame(256, data, bus=bus) for bus in (1, 2, "can1", "can2", 3, "can3", "vcan")]
-    batch = decoder.decode(decoder.gather(messages, None))
+    batch = decoded(decoder, messages)
     assert batch.channel.tolist() == [0, 1, 0, 1]
     assert batch.value[:, 0].tolist() == [10.0, 500.0, 10.0, 500.0]
     with pytest.raises(SourceError, match=r"ENGINE and MOTOR \(two.dbc\) have the same id 0x100; say on which bus"):
@@ -169,7 +170,7 @@ def test_a_float_that_is_nan_and_one_that_is_infinite_are_missing(tmp_path):
     decoder = decoding(tmp_path, [sensor(0, "WIDE", "Ratio")])
     values = [1.5, np.nan, np.inf, -np.inf]
     messages = [frame(512, np.float64(v).tobytes(), extended=True) for v in values]
-    batch = decoder.decode(decoder.gather(messages, None))
+    batch = decoded(decoder, messages)
     np.testing.assert_array_equal(batch.value[:, 0], [1.5, np.nan, np.nan, np.nan])
 
 
@@ -179,12 +180,12 @@ def test_positions_become_metres_from_the_first_valid_fix(tmp_path):
     decoder = decoding(tmp_path, [channel], width=2, report=reports)
     fixes = [(200.0, 10.0), (56.0, 10.0), (56.001, 10.0), (56.0, 10.001)]
     raw = [np.round(np.array(fix) * 1e7).astype("<i4").tobytes() for fix in fixes]
-    batch = decoder.decode(decoder.gather([frame(258, data) for data in raw], None))
+    batch = decoded(decoder, [frame(258, data) for data in raw])
     assert np.isnan(batch.value[0]).all()
     np.testing.assert_array_equal(batch.value[1], [0.0, 0.0])
     assert batch.value[2] == pytest.approx([0.0, 111.342], abs=0.01)
     assert batch.value[3] == pytest.approx([62.393, 0.0], abs=0.01)
-    later = decoder.decode(decoder.gather([frame(258, raw[2])], None))
+    later = decoded(decoder, [frame(258, raw[2])])
     np.testing.assert_array_equal(later.value[0], batch.value[2])
 
 
@@ -223,7 +224,7 @@ def test_a_recording_decodes_as_cantools_does(data):
         messages.append(message)
         if len(messages) == 16000:
             break
-    batch = decoder.decode(decoder.gather(messages, None))
+    batch = decoded(decoder, messages)
     wanted = [m for m in messages if m.channel == 0 and m.arbitration_id in ids]
     assert len(batch) == len(wanted) > 2000
     for message, k, row in zip(wanted, batch.channel, batch.value, strict=True):
@@ -247,7 +248,7 @@ def test_a_frame_brings_the_noise_of_its_reading(tmp_path):
         for torque in (300.0, 0.0, -5.0, 1.0)
     ]
     frames = [frame(256, item) for item in (*data, data[0][:4])] + [frame(258, bytes(8))]
-    batch = decoder.decode(decoder.gather(frames, None))
+    batch = decoded(decoder, frames)
     nan = np.nan
     np.testing.assert_allclose(
         batch.value,
@@ -278,7 +279,7 @@ def test_an_accuracy_is_no_value_of_its_sensor(tmp_path):
     database = cantools.database.load_file(dbc(tmp_path), strict=False)
     for latitude, missing in ((200.0, True), (50.0, False)):
         data = database.encode_message("ENGINE", {"Temp": latitude, "Rpm": 10.0, "Torque": 3.0, "Ok": 1})
-        batch = decoder.decode(decoder.gather([frame(256, data)], None))
+        batch = decoded(decoder, [frame(256, data)])
         assert np.isnan(batch.value[0, :2]).all() == missing == bool(decoder.expected)
     np.testing.assert_array_equal(batch.value, [[0.0, 0.0, 9.0, 9.0]])
 
@@ -290,7 +291,7 @@ def test_variances_convert_by_the_square(tmp_path, unit, square):
     decoder = decoding(tmp_path, [fix])
     database = cantools.database.load_file(dbc(tmp_path), strict=False)
     data = database.encode_message("ENGINE", {"Temp": 20.0, "Rpm": 0.0, "Torque": 3.0, "Ok": 1})
-    batch = decoder.decode(decoder.gather([frame(256, data)], None))
+    batch = decoded(decoder, [frame(256, data)])
     np.testing.assert_allclose(batch.value, [[20.0, 6.0 * square]], rtol=1e-12)
 
 
@@ -313,6 +314,6 @@ def test_values_that_the_dbc_or_j1939_excludes_are_missing_and_named(
     assert ends_of([(path, None)], channel) == (tuple(0.5 * float(end) + 1.0 for end in ends.split()),)
     decoder = Decoder([(path, None)], [channel], width=1, report=reports)
     data = int(raw).to_bytes(8, "little")
-    (found,) = decoder.decode(decoder.gather([frame(512, data, extended=True)], None)).value[:, 0]
+    (found,) = decoded(decoder, [frame(512, data, extended=True)]).value[:, 0]
     np.testing.assert_equal(found, 0.5 * float(value or "nan") + 1.0)
     assert reports.counts["no value A.S"] == (not value) and why in str(reports.texts)

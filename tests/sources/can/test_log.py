@@ -18,7 +18,7 @@ from sources.can.decoder import Decoder
 from sources.can.log import CanLog
 from sources.source import Channel, Condition
 from sources.units import to_ns
-from tests.sources.can.can_tools import Reports, dbc, decoding, frame, same, sensor
+from tests.sources.can.can_tools import Reports, dbc, decoded, decoding, frame, same, sensor
 from tests.support import error_of, read_all
 from tests.waiting import LIMIT_S
 
@@ -65,7 +65,7 @@ def test_written_and_read_equal(tmp_path, messages, suffix):
     decoder = decoder_of(tmp_path, reports)
     log = CanLog([path], decoder, report=reports)
     got = read_all(log)
-    expected = decoder.decode(decoder.gather(messages, None))
+    expected = decoded(decoder, messages)
     np.testing.assert_array_equal(got.value, expected.value)
     assert log.frames == 1000 and not reports.counts
     # ASC and TRC tell times from the start of the log, and TRC in tenths of a millisecond; a double in days holds
@@ -79,7 +79,7 @@ def test_written_and_read_equal(tmp_path, messages, suffix):
 def test_mf4_equals_python_cans_reader(tmp_path, data):
     path = data("can_css_imu100_obd2", "session_00000164", "00000005-60FEB5A8.MF4")
     decoder = css_decoder(data, Reports())
-    expected = decoder.decode(decoder.gather(list(can.LogReader(path)), None))
+    expected = decoded(decoder, list(can.LogReader(path)))
     got = read_all(CanLog([path], decoder))
     np.testing.assert_array_equal(got.value, expected.value)
     assert np.array_equal(got.channel, expected.channel)
@@ -95,9 +95,9 @@ def test_files_follow_one_another_and_chunks_do_not_matter(tmp_path, messages):
     write(parts[2], messages[401:])
     decoder = decoder_of(tmp_path)
     got = read_all(CanLog(parts, decoder))
-    np.testing.assert_array_equal(got.value, decoder.decode(decoder.gather(messages, None)).value)
-    one_by_one = [decoder.decode(decoder.gather([message], None)) for message in messages]
-    assert same(Events.concat(one_by_one, 3), decoder.decode(decoder.gather(messages, None)))
+    np.testing.assert_array_equal(got.value, decoded(decoder, messages).value)
+    one_by_one = [decoded(decoder, [message]) for message in messages]
+    assert same(Events.concat(one_by_one, 3), decoded(decoder, messages))
 
 
 def test_a_cut_file_gives_what_is_there_and_says_so(tmp_path, messages):

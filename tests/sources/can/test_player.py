@@ -15,7 +15,7 @@ from sources.can.player import Encoder, Player
 from sources.simulator import SensorPlan, Simulator, stepped_input
 from sources.source import Channel
 from tests.models import first_state, second_state
-from tests.sources.can.can_tools import Reports, dbc
+from tests.sources.can.can_tools import Reports, dbc, decoded
 from tests.support import Clock, read_all
 from tests.waiting import wait_for
 
@@ -111,7 +111,7 @@ def test_what_is_decoded_is_what_was_simulated(tmp_path):
     bus, path, _, player = play(tmp_path)
     expected = read_all(asset())
     decoder = Decoder([(path, None)], CHANNELS, width=1)
-    got = decoder.decode(decoder.gather(bus.frames, None))
+    got = decoded(decoder, bus.frames)
     assert player.sent == len(bus.frames)
     for index, step in ((0, 0.01), (1, 0.01 / 3.6)):
         theirs = expected.value[expected.of_sensor(index), 0]
@@ -185,11 +185,11 @@ def test_an_old_reading_is_not_sent_again_with_an_input(tmp_path):
     shared = (CHANNELS[0], Channel(INPUT, 0, "power", ("Flow",), "SENSE", units=("W",), model_units=("W",)))
     encoder = Encoder([(path, None)], shared)
     second = 1_000_000_000
-    assert len(encoder.frames(0, [(INPUT, 0, (1.0,)), (READING, 0, (5.0,))], second)) == 1
-    assert encoder.frames(second // 2, [(INPUT, 0, (2.0,))], second) == []
-    assert encoder.frames(5 * second, [], second) == []
-    assert encoder.frames(6 * second, [(READING, 0, (float("nan"),))], second) == []
-    (frame,) = encoder.frames(7 * second, [(INPUT, 0, (float("nan"),)), (READING, 0, (6.0,))], second)
+    assert len(encoder.frames(0, [(INPUT, 0, (1.0,)), (READING, 0, (5.0,))])) == 1
+    assert encoder.frames(second // 2, [(INPUT, 0, (2.0,))]) == []
+    assert encoder.frames(5 * second, []) == []
+    assert encoder.frames(6 * second, [(READING, 0, (float("nan"),))]) == []
+    (frame,) = encoder.frames(7 * second, [(INPUT, 0, (float("nan"),)), (READING, 0, (6.0,))])
     decoder = Decoder([(path, None)], shared, width=1)
-    got = decoder.decode(decoder.gather([frame], None))
+    got = decoded(decoder, [frame])
     assert got.value[:, 0].tolist() == pytest.approx([2.0, 6.0]), "the input as it was last, and the new reading"
