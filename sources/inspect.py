@@ -61,7 +61,7 @@ MIN_SOURCE_VALUES = 20  # Rows of a source that is listed by itself
 
 MAX_LEVELS = 8  # Different values up to which a column describes the source, and is no signal of it
 
-HORIZON_NS = 2_000_000_000  # By which a row may be late in a twin, unless its YAML gives another time.horizon
+HORIZON_NS = 2_000_000_000  # By which a row may be late in a twin, unless its YAML gives another time.max_delay
 
 SERIAL_DATES = (36_526, 73_051)  # Days of the years 2000 to 2100 in Excel's count
 

@@ -33,7 +33,7 @@ def tuning_yaml(
     whole: bool = True,
     widths: ParameterWidths | None = None,
 ) -> str:
-    """Return the sections `estimator`, `filters`, `parameters`, `valid`, `noise`, `sensors` and `gate`.
+    """Return the sections `estimator`, `filters`, `parameters`, `valid_range`, `noise`, `sensors` and `gate`.
 
     A twin whose file has these in place of its own starts with the same settings.
 

@@ -313,7 +313,7 @@ DETECTORS = (
     Detector(
         "dropped",
         "{0.percent:.3g} % of the measurements were dropped, {0.counts}: too late, or with an impossible time",
-        "check the times of the source, or increase time.horizon",
+        "check the times of the source, or increase time.max_delay",
         statistic="share of measurements that are not in the log",
         effect="share of measurements",
     ),

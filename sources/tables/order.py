@@ -81,7 +81,7 @@ class Order:
         if not self._late or self._horizon is None:
             return
         text = (
-            f"{self._late}, more than time.horizon ({self._horizon * 1e-9:g} s), which is a lone wrong time or a "
+            f"{self._late}, more than time.max_delay ({self._horizon * 1e-9:g} s), which is a lone wrong time or a "
             f"change of time zone, so the rows are not sorted: correct {self._column}, or give its time.zone"
         )
         if sorted_rows:

@@ -1,4 +1,4 @@
-"""Learned corrections of a model, `learned` in a twin's YAML: read from a file, and what `nisus learn` does.
+"""Learned corrections of a model, `correction` in a twin's YAML: read from a file, and what `nisus learn` does.
 
 The mathematics are in estimators/model/correction.py.
 """

@@ -40,4 +40,4 @@ class LearnCommand(JsonOption, EstimatorOption, TwinOptions):
     blocks: int = 9
     """Number of blocks with equally many measurements; every third is held out (of 3 the last)."""
     keep: Path | None = None
-    """Write the correction to this .yaml file; a twin uses it with `learned: FILE`."""
+    """Write the correction to this .yaml file; a twin uses it with `correction: FILE`."""

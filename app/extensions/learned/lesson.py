@@ -134,7 +134,7 @@ def _verdict(lesson: Lesson, keep: Path | None) -> Topic:
         return Topic("Verdict", ("Not better than the physics alone, so nothing is kept:", *lesson.reasons))
     noise = ", ".join(f"{name}: {{variance: {value:g}}}" for name, value in lesson.noise.items())
     file = keep.name if keep else "FILE"
-    lines = f"In the twin's YAML: learned: {file}" + (f", and noise: {{{noise}}}" if noise else "")
+    lines = f"In the twin's YAML: correction: {file}" + (f", and noise: {{{noise}}}" if noise else "")
     return Topic("Verdict", ("Better on blocks from which it did not learn.", lines))
 
 
@@ -173,7 +173,7 @@ def correction_text(
     own, learned = noises_of(physics, trained, corrects)
     lines = [
         f"# What {physics.name} leaves out, learned by `nisus learn {twin.name}`. In the YAML of a twin:",
-        "#   learned: the name of this file",
+        "#   correction: the name of this file",
         *(f"#   noise: {{{name}: {{variance: {value:g}}}}}   where it knows" for name, value in own.items()),
         *as_section("learned", head.model_dump(mode="json", exclude_defaults=True)),
         f"corrects: {as_flow(list(corrects))}",

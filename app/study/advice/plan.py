@@ -496,7 +496,7 @@ def _named(option: str, name: str, found: RecordingContents, every: Sequence[Sig
 
 
 def _identifier(one: Signal, taken: set[str]) -> str:
-    """A name for Python and YAML, of its own; of a source of rows COLUMN_ID, as `by` names it."""
+    """A name for Python and YAML, of its own; of a source of rows COLUMN_ID, as `landmark_column` names it."""
     text = re.sub(r"\W+", "_", one.series.column or one.name, flags=re.ASCII).strip("_").lower() or "value"
     if text[0].isdigit() or keyword.iskeyword(text) or text in ("on", "off", "yes", "no", "null", "true", "false"):
         text = f"s_{text}"

@@ -30,7 +30,7 @@ rates: [[0.1], [0.2], [0.1]]
 """
 TWIN = """\
 model: motor_winding
-learned: correction.yaml
+correction: correction.yaml
 source: {type: simulator, seed: 1, step: 1.0, duration: 60}
 """
 
