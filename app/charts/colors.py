@@ -40,7 +40,6 @@ def mixed(a: RGB, b: RGB, share: float) -> RGB:
 class Palette:
     """One theme; `health` is by the names of `HEALTH_NAMES`."""
 
-    ground: RGB
     panel: RGB
     ink: RGB
     faint: RGB

@@ -274,7 +274,6 @@ class Status:
     finished: bool
     recording: Path | None
     latency_ms: float | None
-    latency_p50_ms: float | None
     faults: tuple[FaultStatus, ...] = ()
     integrity: ProtectionLevels | None = None
     awaited: str | None = None

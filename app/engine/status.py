@@ -92,7 +92,6 @@ def status_of(
         sensor_nis=_nis_of_sensors(fold.events, track, len(model.sensors)),
         grades=own_grades(model, track, fold.u) if last >= 0 else {},
         latency_ms=watchers.latency.percentile(99.0),
-        latency_p50_ms=watchers.latency.percentile(50.0),
         integrity=watchers.integrity.of(fields["revision"]),
         faults=layer.status() if layer is not None else (),
         sensor_rows=rows.by_sensor,

@@ -34,10 +34,6 @@ class SvgPath {
     const r = round(radius);
     this.d += `M${round(x - radius)} ${round(y)}a${r} ${r} 0 1 0 ${2 * r} 0a${r} ${r} 0 1 0 ${-2 * r} 0Z`;
   }
-
-  closePath() {
-    this.d += "Z";
-  }
 }
 
 // In place of a canvas's context, as far as uPlot and drawing.js use one.
