@@ -195,7 +195,7 @@ class FleetRules:
         found = [(item.rule, item.evaluate(names, table, now)) for item in self._rules.values()]
         return [(rule, message) for rule, message in found if message is not None]
 
-    def state(self) -> list[tuple[tuple[str, ...], JsonObject]]:
+    def state(self) -> list[tuple[object, JsonObject]]:
         """Return the open alerts, for JSON."""
         now = self._clock()
         states = [(key, rule.state(now)) for key, rule in self._rules.items()]

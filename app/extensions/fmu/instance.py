@@ -163,7 +163,7 @@ class Fmu:
                 return self._rows(X, u, p, n, lambda: self._through_events(dt))
             return _rk4(lambda at: self._rows(at, u, p, n, self._rates), X, dt)
 
-    def measured(self, references: list[int]) -> Callable[[np.ndarray, np.ndarray, np.ndarray], np.ndarray]:
+    def measured(self, references: list[int]) -> Callable[..., np.ndarray]:
         """Return h(X, u, p) of the variables with these value references: the measurements (N, ny)."""
 
         def h(X: np.ndarray, u: np.ndarray, p: np.ndarray) -> np.ndarray:

@@ -236,7 +236,7 @@ class MqttSource:
             NO_BROKER, f"no measurements from the broker at {self._place}: {printable(why)}; it is tried again"
         )
 
-    def _callback(self, topic: TopicMap) -> Callable[[Client, object, MQTTMessage], None]:
+    def _callback(self, topic: TopicMap) -> Callable[..., None]:
         def arrived(client: Client, _data: object, packet: MQTTMessage) -> None:
             if self._waiting.qsize() < MAX_WAITING:
                 self._waiting.put((topic, packet))

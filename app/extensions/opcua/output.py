@@ -21,7 +21,6 @@ from .source import run_again
 
 if TYPE_CHECKING:
     from asyncua import Node, Server
-    from asyncua.server.user_managers import UserManager
 
 NAMESPACE = "urn:nisus"
 
@@ -129,7 +128,7 @@ class OpcUaOutput:
                     for name, value in values_of(self._message).items():
                         await server.write_attribute_value(nodes[name].nodeid, value)
 
-    def _users(self) -> UserManager:
+    def _users(self) -> object:
         """Return the manager of users: none may write, and with a password only its user may read."""
         from asyncua.crypto.permission_rules import User, UserRole
         from asyncua.server.user_managers import UserManager

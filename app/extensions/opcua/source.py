@@ -50,7 +50,7 @@ class OpcUaSource:
                 text = f"source: node {quoted(node)} of {name} is no node id; it must be like ns=2;s=Tank.Level"
                 raise ConfigError(text) from None
         self._report = report
-        self._last: dict[str, tuple[object, object]] = {}
+        self._last: dict[str, object] = {}
         self.connected = threading.Event()
         """Set while the nodes are subscribed to."""
         self._loop = asyncio.new_event_loop()
