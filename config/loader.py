@@ -132,7 +132,7 @@ def load_text(
     return Loaded(config, path, text, places, version, without)
 
 
-def _add_baseline(data: dict[str, Any], places: ValuePlaces, path: Path) -> str:
+def _add_baseline(data: dict[str, object], places: ValuePlaces, path: Path) -> str:
     """Put the section of a baseline's file into a twin's data; return its text."""
     text, own, lines = read_yaml(read_text(path, "nisus twins"), shown_path(path))
     if not isinstance(own, dict) or set(own) != {"baseline"}:
@@ -206,7 +206,7 @@ def _paths_of(data: Any, there: Callable[[str], str], folder: Path) -> Iterator[
     yield from of_source(data.get("source"), ("source",))
 
 
-def _override(data: dict[str, Any], places: ValuePlaces, dotted_key: str, text: str) -> None:
+def _override(data: dict[str, object], places: ValuePlaces, dotted_key: str, text: str) -> None:
     """Put one command-line value where it belongs; the schema judges the result."""
     option = f"--set {dotted_key}={text}"
     parts = dotted_key.split(".")

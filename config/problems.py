@@ -43,7 +43,7 @@ def shown(value: object) -> str:
 S = TypeVar("S", bound=BaseModel)
 
 
-def check_section(kind: type[S], text: str, path: Path, rule: str) -> tuple[S, dict[str, Any], ValuePlaces]:
+def check_section(kind: type[S], text: str, path: Path, rule: str) -> tuple[S, dict[str, object], ValuePlaces]:
     """Check YAML against a schema; return the section, the data, and the place of each value.
 
     `rule` ends the error text if the file is no mapping.

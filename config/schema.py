@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import json
 import re
-from typing import Annotated, Any, ClassVar, Literal
+from typing import Annotated, ClassVar, Literal
 
 from pydantic import BeforeValidator, ConfigDict, Field, model_validator
 
@@ -508,7 +508,7 @@ class TwinSection(Section):
 TwinSection.model_rebuild()  # on import, as several threads may need it first
 
 
-def json_schema() -> dict[str, Any]:
+def json_schema() -> dict[str, object]:
     """Return the schema, with a description of every key."""
     schema = TwinSection.model_json_schema(mode="validation")
     return {

@@ -30,7 +30,7 @@ class Version:
     name: str
     path: Path
     text: str
-    data: Mapping[str, Any]
+    data: Mapping[str, object]
     section: TuningSection
     places: ValuePlaces
 
@@ -121,7 +121,7 @@ def check_name(name: str) -> str:
     return name
 
 
-def overlay(data: dict[str, Any], places: ValuePlaces, version: Version) -> None:
+def overlay(data: dict[str, object], places: ValuePlaces, version: Version) -> None:
     """Put a version's values in place of a twin's; errors about them name the version's file and line.
 
     Entries are replaced one by one, so that those which a version lacks stay (limits of a sensor, another filter's
@@ -142,7 +142,7 @@ def overlay(data: dict[str, Any], places: ValuePlaces, version: Version) -> None
             _merge(data, (key,), value, places, version)
 
 
-def _merge(data: dict[str, Any], key: Key, value: dict[str, Any], places: ValuePlaces, version: Version) -> None:
+def _merge(data: dict[str, object], key: Key, value: dict[str, object], places: ValuePlaces, version: Version) -> None:
     own = data.get(str(key[-1]))
     if not isinstance(own, dict):
         # A parameter of the twin may be a number, to which the version adds a width.
@@ -163,7 +163,7 @@ def _placed(places: ValuePlaces, key: Key, version: Version) -> None:
         places.options[inner] = version.places.at(inner)
 
 
-def keep_options(data: dict[str, Any], places: ValuePlaces) -> None:
+def keep_options(data: dict[str, object], places: ValuePlaces) -> None:
     """Move the options of the YAML's own filter to `filters`, before another name takes its place.
 
     So they are there when that filter runs after all: named on the command line, chosen on the page, or compared.

@@ -135,7 +135,7 @@ class Estimator:
     model_runs: str
     fails_when: str
     source: str
-    functions: tuple[Any, Any, Any, Any]
+    functions: tuple[Callable, Callable, Callable, Callable]
     state_size: Callable[[Options, int], int]
     work_size: Callable[[Options, int, int], int]
     moments: Callable[[Options, np.ndarray, int], tuple[np.ndarray, np.ndarray]]
@@ -219,6 +219,6 @@ class Estimator:
 
 
 @lru_cache(maxsize=64)
-def _code(functions: tuple[Any, Any, Any, Any]) -> Code:
+def _code(functions: tuple[Callable, Callable, Callable, Callable]) -> Code:
     signatures = (start_signature, predict_signature, update_signature, describe_signature)
     return Code(*(address(function, signature) for function, signature in zip(functions, signatures, strict=True)))

@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
-from typing import Any
+from collections.abc import Sequence
 
 import numpy as np
+from numpy.typing import ArrayLike
 
 from .errors import LARGEST, EstimatorError
 from .estimator import Estimator, Options
@@ -20,7 +21,7 @@ ROUNDING = 1e-12
 """Tolerance for negative eigenvalues and asymmetry of a covariance, as a share of the largest variance."""
 
 
-def check_pairs(pairs: Any, model: StateSpaceModel) -> np.ndarray:
+def check_pairs(pairs: ArrayLike | None, model: StateSpaceModel) -> np.ndarray:
     """Return pairs of states as (k, 2) int64.
 
     Raises:
@@ -91,7 +92,7 @@ def check_base(base: Base, model: StateSpaceModel) -> None:
     _check_sizes("base", base.mean, base.cov, model)
 
 
-def check_prior(prior: tuple[Any, Any], model: StateSpaceModel, entry: Estimator) -> tuple[np.ndarray, np.ndarray]:
+def check_prior(prior: Sequence[ArrayLike], model: StateSpaceModel, entry: Estimator) -> tuple[np.ndarray, np.ndarray]:
     """Return a prior's mean (nx,) and covariance (nx, nx), or variances (1, nx) of a large or shaped state.
 
     Raises:

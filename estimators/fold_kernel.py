@@ -3,10 +3,10 @@
 from __future__ import annotations
 
 from functools import lru_cache
-from typing import Any
 
 import numpy as np
 from numba import types
+from numba.core.registry import CPUDispatcher
 
 from .compiled.context import context_at, context_type, prior, sensor_rows, steps_of
 from .compiled.verdict import limit_of
@@ -261,7 +261,7 @@ run_and_judge_signature = i64(
 
 
 @lru_cache(maxsize=1)
-def compiled() -> tuple[Any, Any]:
+def compiled() -> tuple[CPUDispatcher, CPUDispatcher]:
     """Return `run_and_judge` and `begin`, compiled for their only signatures or loaded from the cache."""
     run_and_judge.compile(run_and_judge_signature.args)
     begin.compile(begin_signature.args)
@@ -269,7 +269,7 @@ def compiled() -> tuple[Any, Any]:
 
 
 @lru_cache(maxsize=1)
-def compiled_judge() -> Any:
+def compiled_judge() -> CPUDispatcher:
     """Return `judge` for the loop in Python, compiled or loaded from the cache with what else that calls."""
     judge.compile(judge_signature.args)
     screen_reading.compile(screen_signature.args)

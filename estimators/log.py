@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import numpy as np
+from numpy.typing import ArrayLike
 
 from .errors import EventError
 from .events import arrays
@@ -104,7 +105,7 @@ class Log:
     def _columns(self) -> tuple[np.ndarray, ...]:
         return self.t, self.arrival, self.kind, self.channel, self.value
 
-    def add(self, sensor: str, seconds: Any, values: Any, *, variance: Any = None) -> int:
+    def add(self, sensor: str, seconds: ArrayLike, values: ArrayLike, *, variance: ArrayLike | None = None) -> int:
         """Insert measurements of one sensor.
 
         Args:
@@ -122,7 +123,7 @@ class Log:
         """
         return self._put(arrays.readings(self._named("add"), sensor, seconds, values, variance))
 
-    def add_inputs(self, seconds: Any, **inputs: Any) -> int:
+    def add_inputs(self, seconds: ArrayLike, **inputs: ArrayLike) -> int:
         """Insert inputs; each holds until its next value.
 
         Args:
@@ -137,7 +138,7 @@ class Log:
         """
         return self._put(arrays.inputs(self._named("add_inputs"), seconds, inputs))
 
-    def add_truth(self, seconds: Any, **states: Any) -> int:
+    def add_truth(self, seconds: ArrayLike, **states: ArrayLike) -> int:
         """Insert true states, against which the estimate is scored. The filter never uses them.
 
         Args:
@@ -152,7 +153,7 @@ class Log:
         """
         return self._put(arrays.truth(self._named("add_truth"), seconds, states))
 
-    def add_ticks(self, seconds: Any) -> int:
+    def add_ticks(self, seconds: ArrayLike) -> int:
         """Insert queries at times `seconds`, shape (N,) or one number: each adds a row with the estimate to the track.
 
         Returns:

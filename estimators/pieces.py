@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 from .estimator import describe_signature, predict_signature, start_signature, update_signature
 from .fold_kernel import (
@@ -17,7 +17,7 @@ from .fold_kernel import (
     screen_reading,
     screen_signature,
 )
-from .numerics.jit import threaded
+from .numerics.jit import CPUDispatcher, threaded
 from .registry import ESTIMATORS
 from .smoothing.moments_back import PIECES
 
@@ -48,7 +48,7 @@ def pieces_of(name: str) -> list[Piece]:
     return [Piece(name, place) for place in range(2 if ESTIMATORS[name].interpreted else 4)]
 
 
-def function_of(piece: Piece) -> tuple[Any, tuple[Any, ...]]:
+def function_of(piece: Piece) -> tuple[CPUDispatcher, tuple[object, ...]]:
     """Return the function of a piece, and the types of its arguments."""
     if piece.of == SMOOTHER:
         return PIECES[piece.place]
@@ -70,25 +70,15 @@ def function_of(piece: Piece) -> tuple[Any, tuple[Any, ...]]:
     )[piece.place]
 
 
-def compile_into_cache(function: Any, types: tuple[Any, ...]) -> None:
+def compile_into_cache(function: CPUDispatcher, types: tuple[object, ...]) -> None:
     """Compile a function for these arguments, if it is not in the cache."""
     # Code from the cache may start threads.
     threaded()
     function.compile(types)
 
 
-def is_cached(function: Any, types: tuple[Any, ...]) -> bool:
+def is_cached(function: CPUDispatcher, types: tuple[object, ...]) -> bool:
     """Return whether a function is in the cache, which takes a tenth of a millisecond."""
     cache = function._cache
     key = cache._index_key(types, function.targetctx.codegen())
     return types in function.overloads or key in cache._cache_file
-
-
-def make(piece: Piece) -> None:
-    """Compile a piece into the cache, if it is missing."""
-    compile_into_cache(*function_of(piece))
-
-
-def is_made(piece: Piece) -> bool:
-    """Return whether a piece is in the cache."""
-    return is_cached(*function_of(piece))

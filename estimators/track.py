@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 from numba import types
@@ -56,28 +56,28 @@ class Track(NamedTuple):
     a state has been corrected, while its memory is in alarm (diagnostics/memory.py), else 1.
     """
 
-    mean: Any
-    std: Any
-    cross: Any
-    innovation: Any
-    innovation_std: Any
-    nis: Any
-    log_likelihood: Any
-    dof: Any
-    verdict: Any
-    age: Any
-    nis_mean: Any
-    nis_low: Any
-    nis_high: Any
-    consistency: Any
-    health: Any
-    whitened: Any
-    alarms: Any
-    flags: Any
-    screened: Any
-    effective: Any
-    ancestors: Any
-    factor: Any
+    mean: np.ndarray
+    std: np.ndarray
+    cross: np.ndarray
+    innovation: np.ndarray
+    innovation_std: np.ndarray
+    nis: np.ndarray
+    log_likelihood: np.ndarray
+    dof: np.ndarray
+    verdict: np.ndarray
+    age: np.ndarray
+    nis_mean: np.ndarray
+    nis_low: np.ndarray
+    nis_high: np.ndarray
+    consistency: np.ndarray
+    health: np.ndarray
+    whitened: np.ndarray
+    alarms: np.ndarray
+    flags: np.ndarray
+    screened: np.ndarray
+    effective: np.ndarray
+    ancestors: np.ndarray
+    factor: np.ndarray
 
     @staticmethod
     def allocate(rows: int, nx: int, pairs: int, ny: int, width: int | None = None) -> Track:
@@ -86,7 +86,7 @@ class Track(NamedTuple):
         shapes = ((rows, next(widths)) if kind.ndim == 2 else rows for kind in track_type.types)
         return Track(*(np.empty(shape, str(kind.dtype)) for shape, kind in zip(shapes, track_type.types, strict=True)))
 
-    def select(self, index: object) -> Track:
+    def select(self, index: slice | np.ndarray) -> Track:
         """Return the rows that a slice, mask or index array selects."""
         return Track(*(column[index] for column in self))
 

@@ -265,7 +265,7 @@ def _shown(value: float | bool | str | None) -> str:
     return quoted(value) if isinstance(value, str) else f"{value:g}"
 
 
-def _mean(values: Any) -> float:
+def _mean(values: np.ndarray) -> float:
     """Return the mean of values; exactly their common value if they are equal."""
     first = np.ravel(values)[0]
     return float(first if np.all(values == first) else np.mean(values))

@@ -2,9 +2,8 @@
 
 from __future__ import annotations
 
-from typing import Any
-
 from estimators import pieces as folds
+from estimators.numerics.jit import CPUDispatcher
 from estimators.pieces import Piece
 
 from .can.signals import extract, extract_signature
@@ -13,7 +12,7 @@ from .mapping import emit, emit_signature
 FRAMES, VALUES = "frames", "values"
 """In place of a filter's name: bits of frames to values, and values to events."""
 
-KERNELS: dict[str, tuple[Any, Any]] = {FRAMES: (extract, extract_signature), VALUES: (emit, emit_signature)}
+KERNELS = {FRAMES: (extract, extract_signature), VALUES: (emit, emit_signature)}
 
 
 def pieces_of(name: str) -> list[Piece]:
@@ -26,7 +25,7 @@ def needs(name: str) -> tuple[str, ...]:
     return (name,) if name in KERNELS else (folds.LOOP, name)
 
 
-def function_of(piece: Piece) -> tuple[Any, tuple[Any, ...]]:
+def function_of(piece: Piece) -> tuple[CPUDispatcher, tuple[object, ...]]:
     """Return the function of a piece, and the types of its arguments."""
     if piece.of in KERNELS:
         kernel, signature = KERNELS[piece.of]

@@ -16,6 +16,7 @@ from typing import Any
 import numpy as np
 from llvmlite import ir
 from numba import from_dtype, types
+from numba.core.registry import CPUDispatcher
 from numba.core.serialize import dumps
 from numba.extending import intrinsic
 
@@ -95,10 +96,10 @@ def place_of_record(context: np.void) -> int:
 
 
 @intrinsic
-def place_of(typing_context: Any, context: Any) -> Any:
+def place_of(typing_context: object, context: types.Record) -> tuple[object, Callable]:
     """Return the address of a context, as a parallel loop takes no records."""
 
-    def codegen(_: Any, builder: Any, signature: Any, given: Any) -> Any:
+    def codegen(_: object, builder: ir.IRBuilder, signature: object, given: list[ir.Value]) -> ir.Value:
         return builder.ptrtoint(given[0], ir.IntType(64))
 
     return i64(context_type), codegen
@@ -311,12 +312,12 @@ def _h_rows_shared(x, stride, n, u, p, out, out_stride, more):
         )
 
 
-def looped_f(f: Any, nx: int, nu: int, parameters: int) -> Any:
+def looped_f(f: CPUDispatcher, nx: int, nu: int, parameters: int) -> CPUDispatcher:
     """Return a dispatcher of f_rows(x, stride, n, u, p, dt, out, out_stride): f of n rows, `stride` numbers apart."""
     return _looped(_f_rows, f, {"NX": nx, "NU": nu, "PARAMETERS": parameters})
 
 
-def looped_h(h: Any, nx: int, nu: int, parameters: int, ny: int, *, shared: bool = False) -> Any:
+def looped_h(h: CPUDispatcher, nx: int, nu: int, parameters: int, ny: int, *, shared: bool = False) -> CPUDispatcher:
     """Return a dispatcher of h_rows(x, stride, n, u, p, out, out_stride): h of n rows, `stride` numbers apart.
 
     With `shared` it takes one more argument, a tuple of further arguments of h.
@@ -325,7 +326,7 @@ def looped_h(h: Any, nx: int, nu: int, parameters: int, ny: int, *, shared: bool
     return _looped(template, h, {"NX": nx, "NU": nu, "PARAMETERS": parameters, "NY": ny})
 
 
-def _looped(template: Callable, dispatcher: Any, sizes: dict[str, int]) -> Any:
+def _looped(template: Callable, dispatcher: CPUDispatcher, sizes: dict[str, int]) -> CPUDispatcher:
     """Return the template around a model's function, cached under the function's own file, line and name.
 
     Numba keys its cache by these, the bytecode and the closure, but not by globals; so the sizes, and the closure of

@@ -7,7 +7,6 @@ Source: Squire & Trapp (1998), doi:10.1137/S003614459631241X.
 from __future__ import annotations
 
 from collections.abc import Mapping
-from typing import Any
 
 import numpy as np
 
@@ -60,7 +59,7 @@ def complex_step(target, of_sensor, x, u, p, dt, J, scratch):
 
 
 def constant_rows(
-    static: Mapping[str, Any], p: np.ndarray, rows: list[int], nx: int
+    static: Mapping[str, np.ndarray], p: np.ndarray, rows: list[int], nx: int
 ) -> tuple[np.ndarray, np.ndarray, list[np.ndarray]]:
     """Return `H` and `H_mode` of a linear model without inputs, whose dh/dx is the same at every state.
 

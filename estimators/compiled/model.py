@@ -19,7 +19,7 @@ from ..model.check import check_parts, probe, probe_angles, probe_likelihoods
 from ..model.state_space import LARGE, Field, StateSpaceModel
 from ..model.wrapping import is_derived, noise_function
 from ..numerics.helpers import with_helpers
-from ..numerics.jit import address, jit, plain
+from ..numerics.jit import Signature, address, jit, plain
 from .black_box import ANSWER, BlackBox, answered_f, answered_h
 from .context import (
     F_signature,
@@ -53,7 +53,7 @@ class CompiledModel:
     h: tuple[Callable, ...]
     Q: Callable
     static: dict[str, Any] = field(repr=False)
-    keep_alive: tuple[Any, ...] = field(repr=False)
+    keep_alive: tuple[object, ...] = field(repr=False)
     draw: Callable | None = None
     box: BlackBox | None = None
 
@@ -217,7 +217,7 @@ def _call_h(target: int, x: np.ndarray, u: np.ndarray, p: np.ndarray, out: np.nd
     call_h(target, *(np.ascontiguousarray(item, float) for item in (x, u, p)), out)
 
 
-def _of_sensors(made: ModelCode, model: StateSpaceModel, field: str, signature: Any) -> list[int]:
+def _of_sensors(made: ModelCode, model: StateSpaceModel, field: str, signature: Signature) -> list[int]:
     """Return the addresses of an optional function of the sensors."""
 
     def own(k: int) -> int:

@@ -20,10 +20,11 @@ import numpy as np
 from llvmlite import binding, ir
 from numba import typeof, types
 from numba.core import ir as numba_ir
-from numba.core.compiler import CompilerBase, DefaultPassBuilder
-from numba.core.compiler_machinery import FunctionPass, register_pass
+from numba.core.compiler import CompilerBase, DefaultPassBuilder, StateDict
+from numba.core.compiler_machinery import FunctionPass, PassManager, register_pass
 from numba.core.errors import NumbaError
-from numba.core.registry import cpu_target
+from numba.core.registry import CPUDispatcher, cpu_target
+from numba.core.typing import Signature as TypeSignature
 from numba.core.untyped_passes import TranslateByteCode
 
 from ..model.check import uncompilable
@@ -73,9 +74,9 @@ class ModelCode:
     def __init__(self, model: StateSpaceModel) -> None:
         self._model = model
         self._sizes = [len(sensor.rows) for sensor in model.sensors]
-        self.kept: list[Any] = []
+        self.kept: list[object] = []
 
-    def compiled(self, function: Callable, signature: Any, what: str) -> Any:
+    def compiled(self, function: Callable, signature: TypeSignature, what: str) -> CPUDispatcher:
         """Return the dispatcher of a function that is compiled for a signature.
 
         Raises:
@@ -88,16 +89,16 @@ class ModelCode:
             raise uncompilable(self._model, what, function, error) from None
         return dispatcher
 
-    def address(self, dispatcher: Any, signature: Any) -> int:
+    def address(self, dispatcher: CPUDispatcher, signature: TypeSignature) -> int:
         """Compile a dispatcher, and return where its code starts."""
         self.kept.append(dispatcher)
         return address(dispatcher, signature)
 
-    def of(self, function: Callable | None, signature: Any, what: str) -> int:
+    def of(self, function: Callable | None, signature: TypeSignature, what: str) -> int:
         """Return the address of a function, 0 if the model has none; raises as `compiled`."""
         return 0 if function is None else address(self.compiled(function, signature, what), signature)
 
-    def over_complex(self, function: Any, signature: Any) -> int:
+    def over_complex(self, function: Any, signature: TypeSignature) -> int:
         """Return the address of a function over complex numbers, or 0 if it is not analytic (comparisons, abs, atan2).
 
         Numba raises many kinds of errors; each means the same here.
@@ -111,7 +112,7 @@ class ModelCode:
     def of_sensors(
         self,
         functions: Sequence[Callable | None],
-        signature: Any,
+        signature: TypeSignature,
         own: Callable[[int], int],
         common: Callable[[SharedCode], int],
     ) -> list[int]:
@@ -130,7 +131,7 @@ class ModelCode:
                 stubs = Stubs(target, signature, shared) if target else None
                 self.kept.append(stubs)
                 found |= zip(shared.members, stubs.addresses if stubs else [0] * len(shared.members), strict=True)
-        same: dict[Any, int] = {}
+        same: dict[tuple[Callable | None, int], int] = {}
         for k, (function, size) in enumerate(zip(functions, self._sizes, strict=True)):
             if k in found:
                 continue
@@ -156,7 +157,7 @@ class LiftedValues(FunctionPass):  # type: ignore[misc]
     def __init__(self) -> None:
         FunctionPass.__init__(self)
 
-    def run_pass(self, state: Any) -> bool:
+    def run_pass(self, state: StateDict) -> bool:
         """Change the function in place."""
         code, passed_on = state.func_ir, state.func_id.func.__passed_on__
         for block in code.blocks.values():
@@ -177,7 +178,7 @@ class LiftedValues(FunctionPass):  # type: ignore[misc]
 class LiftedCompiler(CompilerBase):  # type: ignore[misc]
     """Numba's compiler with that pass."""
 
-    def define_pipelines(self) -> list[Any]:
+    def define_pipelines(self) -> list[PassManager]:
         """Return the pipeline."""
         passes = DefaultPassBuilder.define_nopython_pipeline(self.state)
         passes.add_pass_after(LiftedValues, TranslateByteCode)
@@ -193,11 +194,11 @@ class SharedCode:
     """
 
     members: tuple[int, ...]
-    dispatcher: Any
-    types: tuple[Any, ...]
-    values: tuple[tuple[Any, ...], ...]
+    dispatcher: CPUDispatcher
+    types: tuple[object, ...]
+    values: tuple[tuple[object, ...], ...]
 
-    def with_own(self, signature: Any) -> tuple[Any, Any]:
+    def with_own(self, signature: TypeSignature) -> tuple[CPUDispatcher, TypeSignature]:
         """Return the dispatcher, and its signature: one of the functions' own and the further arguments."""
         return self.dispatcher, signature.return_type(*signature.args, *self.types)
 
@@ -209,7 +210,7 @@ def shared_codes(functions: Sequence[Callable | None], sizes: Sequence[int]) -> 
         functions: Functions of one signature.
         sizes: Number of rows that each fills.
     """
-    groups: dict[Any, list[int]] = {}
+    groups: dict[tuple[object, ...], list[int]] = {}
     for k, (function, size) in enumerate(zip(functions, sizes, strict=True)):
         python = plain(function)
         if isinstance(python, FunctionType) and python.__closure__:
@@ -222,9 +223,9 @@ def shared_codes(functions: Sequence[Callable | None], sizes: Sequence[int]) -> 
             yield SharedCode(tuple(members), dispatcher, tuple(map(_type, values[0])), tuple(values))
 
 
-def _kind(function: Any) -> tuple[Any, ...]:
+def _kind(function: FunctionType) -> tuple[object, ...]:
     """Return a key that functions have in common if they differ in enclosed numbers, arrays and tuples of them only."""
-    cells: list[Any] = []
+    cells: list[object] = []
     for cell in function.__closure__ or ():
         value = cell.cell_contents
         inner = plain(value)
@@ -235,7 +236,7 @@ def _kind(function: Any) -> tuple[Any, ...]:
     return function.__code__, id(function.__globals__), repr(function.__defaults__), tuple(cells)
 
 
-def _type(value: Any) -> Any:
+def _type(value: Any) -> types.Type | None:
     """Return Numba's type of a value that can be an argument; None if it cannot."""
     if isinstance(value, tuple):
         inside = tuple(map(_type, value))
@@ -247,11 +248,11 @@ def _type(value: Any) -> Any:
     return typeof(value) if number and abs(value) < MAX_INTEGER else None
 
 
-def _lifted(functions: list[Any]) -> tuple[Any, list[tuple[Any, ...]]]:
+def _lifted(functions: list[Any]) -> tuple[CPUDispatcher, list[tuple[object, ...]]]:
     """Return a dispatcher for functions of one kind, and the values of each; none if they are all equal."""
     first = with_helpers(functions[0])
-    cells: list[Any] = []
-    lifted: list[list[Any]] = []
+    cells: list[CellType] = []
+    lifted: list[list[object]] = []
     passed_on: dict[str, tuple[str, ...]] = {}
     rows = [[cell.cell_contents for cell in function.__closure__] for function in functions]
     # Of each enclosed name: what stands in the closure of the first function, and the values of all.
@@ -297,14 +298,14 @@ class Stubs:
         shared: The tuples.
     """
 
-    def __init__(self, target: int, signature: Any, shared: SharedCode) -> None:
+    def __init__(self, target: int, signature: TypeSignature, shared: SharedCode) -> None:
         convention = cpu_target.target_context.call_conv
         own = convention.get_function_type(signature.return_type, signature.args)
         full = convention.get_function_type(signature.return_type, (*signature.args, types.Tuple(shared.types)))
         given = ", ".join(f"{kind} %a{k}" for k, kind in enumerate(own.args))
         kinds = full.args[len(own.args) :]
         call = f"call {own.return_type} inttoptr (i64 {target} to {ir.PointerType(full)})"
-        self._engines: list[Any] = []
+        self._engines: list[binding.ExecutionEngine] = []
         self._arrays = shared.values
         self.addresses: list[int] = []
         for begin in range(0, len(shared.values), STUBS_PER_MODULE):
@@ -331,7 +332,7 @@ def _passed(value: Any) -> Iterator[float | int]:
         yield value
 
 
-def _constant(kind: Any, value: float | int) -> str:
+def _constant(kind: ir.Type, value: float | int) -> str:
     """Return a constant of an LLVM type as text."""
     if isinstance(kind, ir.PointerType):
         return f"{kind} inttoptr (i64 {int(value)} to {kind})"

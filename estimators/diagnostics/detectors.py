@@ -18,7 +18,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Mapping
 from types import MappingProxyType
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 
@@ -113,7 +113,7 @@ class Detector(NamedTuple):
         """Bits of its alarms in `Track.alarms`."""
         return sum(bit_of(name) for name in self.alarms)
 
-    def text(self, facts: Any) -> str:
+    def text(self, facts: object) -> str:
         """Return the sentence of an episode with these facts."""
         wording, remedy = self.wording.format(facts), self.remedy.format(facts)
         return f"{wording}{';' if ':' in wording else ':'} {remedy}"

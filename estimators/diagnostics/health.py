@@ -15,7 +15,7 @@ for correlated sums; Satterthwaite (1946), doi:10.2307/3002019, for the scaled c
 
 from __future__ import annotations
 
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 from numba import types
@@ -62,8 +62,8 @@ class HealthPolicy(NamedTuple):
 class Bounds(NamedTuple):
     """Chi-square quantiles by degrees of freedom, the 95 % bounds."""
 
-    low: Any
-    high: Any
+    low: np.ndarray
+    high: np.ndarray
 
 
 bounds_type = types.NamedUniTuple(F1, len(Bounds._fields), Bounds)
@@ -252,7 +252,7 @@ def normal_nis(model: StateSpaceModel, baseline: np.ndarray) -> np.ndarray:
 
 
 @inlined
-def free_degrees(mean: Any, variance: Any, dof: Any) -> Any:
+def free_degrees(mean: float, variance: float, dof: float) -> float:
     """Return the degrees of freedom of the scaled chi-square of that mean and variance, from 1 to `dof`."""
     return max(1.0, min(2.0 * mean * mean / variance, float(dof)))
 

@@ -3,9 +3,10 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import numpy as np
+from numpy.typing import ArrayLike
 
 from ..errors import EventError, nearest
 from .batch import BEFORE, INPUT, READING, TICK, TRUTH, Events
@@ -14,7 +15,7 @@ if TYPE_CHECKING:
     from ..model.state_space import StateSpaceModel
 
 
-def nanoseconds(name: str, seconds: Any) -> np.ndarray:
+def nanoseconds(name: str, seconds: ArrayLike) -> np.ndarray:
     """Convert seconds to int64 nanoseconds, shape (N,).
 
     Raises:
@@ -31,7 +32,9 @@ def nanoseconds(name: str, seconds: Any) -> np.ndarray:
     return np.rint(s * 1e9).astype(np.int64)
 
 
-def readings(model: StateSpaceModel, sensor: str, seconds: Any, values: Any, variance: Any = None) -> Events:
+def readings(
+    model: StateSpaceModel, sensor: str, seconds: ArrayLike, values: ArrayLike, variance: ArrayLike | None = None
+) -> Events:
     """Return events of one sensor; see `Log.add`."""
     index = _index("sensor", sensor, model.sensor_names, model)
     rows = len(model.sensors[index].rows)
@@ -57,7 +60,7 @@ def readings(model: StateSpaceModel, sensor: str, seconds: Any, values: Any, var
     return batch
 
 
-def inputs(model: StateSpaceModel, seconds: Any, named: Mapping[str, Any]) -> Events:
+def inputs(model: StateSpaceModel, seconds: ArrayLike, named: Mapping[str, ArrayLike]) -> Events:
     """Return events of inputs by name; see `Log.add_inputs`."""
     if not named:
         raise EventError(f"add_inputs: no input is given; {nearest('', model.input_names)}")
@@ -68,7 +71,7 @@ def inputs(model: StateSpaceModel, seconds: Any, named: Mapping[str, Any]) -> Ev
     return batch
 
 
-def truth(model: StateSpaceModel, seconds: Any, named: Mapping[str, Any]) -> Events:
+def truth(model: StateSpaceModel, seconds: ArrayLike, named: Mapping[str, ArrayLike]) -> Events:
     """Return events of true states by name, as few per time as their indices allow; see `Log.add_truth`."""
     if not named:
         raise EventError(f"add_truth: no state is given; {nearest('', model.state_names)}")
@@ -87,7 +90,7 @@ def truth(model: StateSpaceModel, seconds: Any, named: Mapping[str, Any]) -> Eve
     return Events.concat(blocks, model.width)
 
 
-def ticks(width: int, seconds: Any) -> Events:
+def ticks(width: int, seconds: ArrayLike) -> Events:
     """Return queries; see `Log.add_ticks`."""
     return blank(nanoseconds("seconds", seconds), TICK, 0, width)
 
@@ -97,7 +100,7 @@ def blank(t: np.ndarray, kind: int, channel: int, width: int) -> Events:
     return Events.alike(kind, t, np.full((t.size, width), np.nan), channel)
 
 
-def _numbers(name: str, values: Any) -> np.ndarray:
+def _numbers(name: str, values: ArrayLike) -> np.ndarray:
     try:
         return np.asarray(values, float)
     except (TypeError, ValueError):
@@ -105,7 +108,7 @@ def _numbers(name: str, values: Any) -> np.ndarray:
         raise EventError(f"{name} contains {sample!r}; all entries must be numbers") from None
 
 
-def _rows(name: str, values: Any, n: int, rows: int) -> np.ndarray:
+def _rows(name: str, values: ArrayLike, n: int, rows: int) -> np.ndarray:
     y = _numbers(name, values)
     if y.ndim == 0 and rows == 1:
         y = np.full((n, 1), float(y))
@@ -117,7 +120,7 @@ def _rows(name: str, values: Any, n: int, rows: int) -> np.ndarray:
     return y
 
 
-def _column(name: str, values: Any, n: int) -> np.ndarray:
+def _column(name: str, values: ArrayLike, n: int) -> np.ndarray:
     """Return values of one input or state as (n,)."""
     y = _numbers(name, values)
     if y.ndim == 0:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from operator import index
-from typing import Any, NamedTuple
+from typing import NamedTuple, SupportsIndex
 
 import numpy as np
 
@@ -87,7 +87,7 @@ class Events(NamedTuple):
             return self
         return Events(*self[:4], np.pad(self.value, ((0, 0), (0, missing)), constant_values=np.nan))
 
-    def select(self, index: Any) -> Events:
+    def select(self, index: slice | np.ndarray) -> Events:
         """Return the events that a mask, slice or index array selects."""
         return Events(*(column[index] for column in self))
 
@@ -113,7 +113,7 @@ class Events(NamedTuple):
 Events._make = classmethod(lambda cls, columns: cls(*columns))  # type: ignore[method-assign, assignment]
 
 
-def _whole(name: str, value: Any) -> int:
+def _whole(name: str, value: SupportsIndex) -> int:
     """Return an integer; reject a float, whose decimals would be lost."""
     try:
         return index(value)

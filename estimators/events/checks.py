@@ -7,14 +7,13 @@ without one are checked by the fold.
 from __future__ import annotations
 
 from functools import lru_cache
-from typing import Any
 
 import numpy as np
 from numba import types
 
 from ..errors import LARGEST, EventError
 from ..model.state_space import EventLayout
-from ..numerics.jit import i64, jit_brief
+from ..numerics.jit import CPUDispatcher, i64, jit_brief
 from .batch import BEFORE, COLUMN_TYPES, INPUT, KIND_NAMES, MAINTENANCE, MARK, READING, TRUTH, Events
 
 FINE, TIME, KIND, CHANNEL, VALUES, STRAY, VARIANCE = range(7)  # Rules, by which `_look` names a violation
@@ -86,7 +85,7 @@ def _look(t, kind, channel, value, width, rows, nu, nx):
 
 
 @lru_cache(maxsize=1)
-def _looking() -> Any:
+def _looking() -> CPUDispatcher:
     """Return `_look`, compiled for its only signature, which also accepts writable arrays."""
     _look.compile(_signature.args)
     _look.disable_compile()

@@ -3,11 +3,10 @@
 from __future__ import annotations
 
 from functools import lru_cache
-from typing import Any
 
 from numba import types
 
-from ..numerics.jit import I1, I2, i64, inlined, jit_brief
+from ..numerics.jit import I1, I2, CPUDispatcher, i64, inlined, jit_brief
 
 SECOND_NS = 10**9
 
@@ -113,7 +112,7 @@ def _scan(state, t, raw, arrival, rows, start, horizon, utc):
 
 
 @lru_cache(maxsize=1)
-def compiled() -> tuple[Any, Any, Any, Any]:
+def compiled() -> tuple[CPUDispatcher, CPUDispatcher, CPUDispatcher, CPUDispatcher]:
     """Return the functions, compiled for their only signatures."""
     one = (I2, i64, i64, i64, types.boolean, i64)
     _reach.compile((I2, i64, i64, types.boolean))

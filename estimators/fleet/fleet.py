@@ -12,6 +12,7 @@ from typing import Any
 
 import numba
 import numpy as np
+from numpy.typing import ArrayLike
 
 from ..diagnostics.health import NORMALS, HealthPolicy
 from ..errors import EstimatorError, EventError, nearest, quoted
@@ -23,7 +24,7 @@ from ..gate.isolation import Decision
 from ..log import _RANK
 from ..model.state_space import LARGE, StateSpaceModel
 from ..numerics.jit import threaded
-from ..numerics.workspace import WORD, view
+from ..numerics.workspace import WORD, ArrayLayout, view
 from ..registry import find_estimator
 from ..snapshots import Base, Snapshot
 from ..track import Track
@@ -70,7 +71,7 @@ class Fleet:
         tuning: Tuning | Sequence[Tuning] | None = None,
         *,
         assets: int | Sequence[str],
-        values: Mapping[str, Any] | None = None,
+        values: Mapping[str, ArrayLike] | None = None,
         start: float | None = None,
         policy: HealthPolicy | None = None,
         recent: int = RECENT,
@@ -211,12 +212,12 @@ class Fleet:
         lines[:, at : at + size] = states
         return lines
 
-    def _part(self, part: Any, within: int = 0) -> np.ndarray:
+    def _part(self, part: ArrayLayout, within: int = 0) -> np.ndarray:
         """Return a field of all blocks as a view (assets, numbers)."""
         at = within + part.at // WORD
         return self._memory[:, at : at + int(np.prod(part.shape))]
 
-    def _now(self, part: Any) -> np.ndarray:
+    def _now(self, part: ArrayLayout) -> np.ndarray:
         return self._part(part, self._block.now.at // WORD)
 
     @property
@@ -242,7 +243,7 @@ class Fleet:
         self._held = low, high
         code = machine.code
         plan = np.zeros(1, PLAN)
-        values: dict[str, Any] = {
+        values: dict[str, object] = {
             **self._sizes, **policy._asdict(), **code._asdict(),
             "crews": self.threads, "crew_places": self._crew_places.ctypes.data,
             "free": 0 if gates is None else gates.free.ctypes.data,
@@ -261,7 +262,7 @@ class Fleet:
         """Bytes of all assets."""
         return self._memory.nbytes
 
-    def positions(self, asset: Any) -> np.ndarray:
+    def positions(self, asset: ArrayLike) -> np.ndarray:
         """Return the positions of assets (N,), given as names or as positions.
 
         Raises:
@@ -283,7 +284,7 @@ class Fleet:
             known = [str(each) for each in self.assets[:1000]]
             raise EventError(f"the fleet has no asset {quoted(str(name))}; {nearest(str(name), known)}") from None
 
-    def add(self, sensor: str, asset: Any, seconds: Any, values: Any) -> None:
+    def add(self, sensor: str, asset: ArrayLike, seconds: ArrayLike, values: ArrayLike) -> None:
         """Add measurements of one sensor of any assets, in any order; `advance` folds them.
 
         Args:
@@ -298,12 +299,12 @@ class Fleet:
         at, seconds = self._pair(asset, seconds)
         self._put(at, arrays.readings(self.model, sensor, seconds, values), READING)
 
-    def add_inputs(self, asset: Any, seconds: Any, **inputs: Any) -> None:
+    def add_inputs(self, asset: ArrayLike, seconds: ArrayLike, **inputs: ArrayLike) -> None:
         """Add inputs of any assets; each holds until its next value. See `add` and `Log.add_inputs`."""
         at, seconds = self._pair(asset, seconds)
         self._put(at, arrays.inputs(self.model, seconds, inputs), INPUT)
 
-    def add_events(self, asset: Any, events: Events) -> None:
+    def add_events(self, asset: ArrayLike, events: Events) -> None:
         """Add the events of a source, each of its asset; others than measurements, inputs and queries are left out.
 
         Args:
@@ -317,7 +318,7 @@ class Fleet:
         events = events.select(kept)
         self._added.append((at[kept], events.t, _RANK[events.kind] + events.channel, events.value[:, : self._columns]))
 
-    def extend(self, assets: int | Sequence[str], values: Mapping[str, Any] | None = None) -> None:
+    def extend(self, assets: int | Sequence[str], values: Mapping[str, ArrayLike] | None = None) -> None:
         """Append assets, each before its first event, with the shared tuning, or that of the first one.
 
         Args:
@@ -370,7 +371,7 @@ class Fleet:
             cov[j, j] = found.std**2
         return mean, cov
 
-    def set_prior(self, asset: Any, prior: Moments) -> None:
+    def set_prior(self, asset: ArrayLike, prior: Moments) -> None:
         """Give assets that have no events yet another prior, such as that of `sibling_prior`.
 
         Args:
@@ -410,12 +411,12 @@ class Fleet:
         for name, column in columns.items():
             self._plan[name] = column.ctypes.data
 
-    def add_ticks(self, seconds: Any, asset: Any = None) -> None:
+    def add_ticks(self, seconds: ArrayLike, asset: ArrayLike | None = None) -> None:
         """Add queries, of all assets by default: the estimate and health of silent assets become those of that time."""
         at, seconds = self._pair(np.arange(len(self.assets)) if asset is None else asset, seconds)
         self._put(at, arrays.ticks(self.model.width, seconds), TICK)
 
-    def _pair(self, asset: Any, seconds: Any) -> tuple[np.ndarray, Any]:
+    def _pair(self, asset: ArrayLike, seconds: ArrayLike) -> tuple[np.ndarray, np.ndarray]:
         at, given = self.positions(asset), np.asarray(seconds)
         size = at.size if given.ndim == 0 else given.size
         if given.ndim == 0 and size > 1:
@@ -426,7 +427,7 @@ class Fleet:
             raise EventError(f"{at.size} assets for {size} times; give one asset per time")
         return at, given
 
-    def _put(self, at: np.ndarray, batch: Any, kind: int) -> None:
+    def _put(self, at: np.ndarray, batch: Events, kind: int) -> None:
         self._added.append((at, batch.t, _RANK[kind] + batch.channel, batch.value[:, : self._columns]))
 
     def advance(self) -> int:
@@ -478,7 +479,7 @@ class Fleet:
         clock, *rest = (view(part, state) for part in self._state[:6])
         return Snapshot(clock.view(np.int64), *rest)
 
-    def decisions(self, asset: Any) -> list[Decision]:
+    def decisions(self, asset: ArrayLike) -> list[Decision]:
         """Return the latest decisions on rejected sensors of an asset; see `Fold.decisions`.
 
         Raises:

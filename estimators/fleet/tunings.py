@@ -4,9 +4,9 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
-from typing import Any
 
 import numpy as np
+from numpy.typing import ArrayLike
 
 from ..compiled.context import _FIELDS
 from ..compiled.jacobians import constant_rows
@@ -21,7 +21,7 @@ GROUPS = {"Q": "q", "R": "r", "p": "p"}
 class AssetTunings:
     """Tunings of assets that differ from a shared one in some values, and their contexts."""
 
-    def __init__(self, machine: Machine, values: Mapping[str, Any], assets: Sequence[Any]) -> None:
+    def __init__(self, machine: Machine, values: Mapping[str, ArrayLike], assets: Sequence[object]) -> None:
         """Check the values, and make a context for each asset.
 
         Args:
@@ -42,10 +42,10 @@ class AssetTunings:
         """Context of each asset, as its numbers, (assets, fields)."""
         for group, column in self.columns.items():
             self._point(group, column)
-        self._held: list[Any] = []
+        self._held: list[object] = []
         self._point_to_derived()
 
-    def _set(self, key: str, given: Any, assets: Sequence[Any]) -> None:
+    def _set(self, key: str, given: ArrayLike, assets: Sequence[object]) -> None:
         tuning, group = self._machine.tuning, GROUPS.get(key.partition(".")[0])
         column = np.asarray(given, float)
         if column.shape != (len(assets),):

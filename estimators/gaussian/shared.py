@@ -7,7 +7,6 @@ differ only in how mean and covariance pass through f and h; gate, verdict, NIS 
 from __future__ import annotations
 
 from collections.abc import Callable
-from typing import Any
 
 import numpy as np
 
@@ -30,7 +29,7 @@ def state_size(options: Options, nx: int) -> int:
     return nx + nx * nx
 
 
-def work_of(predicting: Callable[..., Any], updating: Callable[..., Any]) -> Callable[[Options, int, int], int]:
+def work_of(predicting: Callable, updating: Callable) -> Callable[[Options, int, int], int]:
     """Return the function of the scratch of a prediction or an update, of their layouts."""
     return lambda options, nx, ny: max(size_of(predicting, nx), size_of(updating, nx, ny))
 

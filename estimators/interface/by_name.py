@@ -14,7 +14,7 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Mapping, Sequence
 from concurrent.futures import Executor
-from contextlib import nullcontext
+from contextlib import AbstractContextManager, nullcontext
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 from importlib import import_module
@@ -22,6 +22,7 @@ from pickle import PicklingError
 from typing import Any
 
 import numpy as np
+from numpy.typing import ArrayLike
 
 from ..compiled.black_box import pool_of
 from ..diagnostics.consistency import Nees, nees
@@ -44,7 +45,7 @@ __all__ = ["fold", "fold_many"]
 NO_COVARIANCES = "the covariances were not kept; fold with covariance=True"
 
 Prior = tuple[Any, Any]
-Values = Mapping[str, Any]
+Values = Mapping[str, ArrayLike]
 
 
 def fold(
@@ -185,7 +186,7 @@ def fold_many(
     ]
 
 
-def _pool(executor: Executor | str | None) -> Any:
+def _pool(executor: Executor | str | None) -> AbstractContextManager[Executor | None]:
     """Return a context manager for an executor, which it shuts down if it created it; or for None."""
     if executor is None or isinstance(executor, Executor):
         return nullcontext(executor)
@@ -267,7 +268,7 @@ def tuned_by_name(
     return _seeded(tuned, seed)
 
 
-def _entries(group: str, name: str, value: Any, model: StateSpaceModel) -> list[tuple[str, float]]:
+def _entries(group: str, name: str, value: ArrayLike, model: StateSpaceModel) -> list[tuple[str, float]]:
     """Return keys of a tuning and their values; a sensor with several rows takes one value or one per row."""
     given = np.asarray(value)
     if given.dtype.kind not in "iufb":

@@ -24,7 +24,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from functools import lru_cache
-from typing import Any
+from typing import TYPE_CHECKING, Any, TypeAlias
 
 import numpy as np
 
@@ -36,6 +36,11 @@ from ..gaussian.ukf import only_rounding
 from ..numerics.linalg import wrapped
 from ..track import FAILED, MISSING, USED
 from .view import View
+
+if TYPE_CHECKING:
+    from filterpy.kalman import EnsembleKalmanFilter, KalmanFilter, UnscentedKalmanFilter
+
+    Filter: TypeAlias = "KalmanFilter | UnscentedKalmanFilter | EnsembleKalmanFilter"
 
 PROCESS, START, PERTURB = range(3)
 """Streams of randomness."""
@@ -61,7 +66,7 @@ def moments_of(view: View, state: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     return state[:n], state[n:].reshape(n, n)
 
 
-def _at(filter_: Any, view: View, state: np.ndarray) -> tuple[Any, np.ndarray, np.ndarray]:
+def _at(filter_: Filter, view: View, state: np.ndarray) -> tuple[Filter, np.ndarray, np.ndarray]:
     """Return a filter that was given the mean and covariance of a state, and these."""
     filter_.x, filter_.P = x, P = moments_of(view, state.copy())
     return filter_, x, P
@@ -93,7 +98,7 @@ def predict_kf(view: View, u: np.ndarray, dt: float, index: int, state: np.ndarr
 def update_kf(view: View, u: np.ndarray, sensor: int, y: np.ndarray, *rest: Any) -> int:
     """Condition on z = y - h(x) + H x, which removes inputs, offsets and turns of angles."""
 
-    def step(state: np.ndarray, rows: np.ndarray, R: np.ndarray) -> Any:
+    def step(state: np.ndarray, rows: np.ndarray, R: np.ndarray) -> Filter:
         filter_, x, _ = _at(objects().KalmanFilter(dim_x=view.nx, dim_z=rows.size), view, state)
         H = view.H(sensor, x, u)[rows]
         nu = wrapped(y[rows] - view.h(sensor, x[None], u)[0, rows], view.angles[sensor][rows])
@@ -115,7 +120,7 @@ def predict_ekf(view: View, u: np.ndarray, dt: float, index: int, state: np.ndar
 def update_ekf(view: View, u: np.ndarray, sensor: int, y: np.ndarray, *rest: Any) -> int:
     """Condition on a measurement, linearised at the prediction."""
 
-    def step(state: np.ndarray, rows: np.ndarray, R: np.ndarray) -> Any:
+    def step(state: np.ndarray, rows: np.ndarray, R: np.ndarray) -> Filter:
         filter_, *_ = _at(objects().Extended(dim_x=view.nx, dim_z=rows.size), view, state)
         angles = view.angles[sensor][rows]
         filter_.update(
@@ -141,7 +146,7 @@ def _residual_of(angles: np.ndarray) -> Callable[..., np.ndarray] | None:
     return (lambda a, b: wrapped(a - b, angles)) if np.any(angles) else None
 
 
-def _unscented(view: View, angles: np.ndarray) -> Any:
+def _unscented(view: View, angles: np.ndarray) -> UnscentedKalmanFilter:
     values = view.options
     points = objects().MerweScaledSigmaPoints(view.nx, values["alpha"], values["beta"], values["kappa"])
     return objects().UnscentedKalmanFilter(
@@ -174,7 +179,7 @@ def predict_ukf(view: View, u: np.ndarray, dt: float, index: int, state: np.ndar
 def update_ukf(view: View, u: np.ndarray, sensor: int, y: np.ndarray, *rest: Any) -> int:
     """Condition on a measurement, with sigma points drawn again from the prediction."""
 
-    def step(state: np.ndarray, rows: np.ndarray, R: np.ndarray) -> Any:
+    def step(state: np.ndarray, rows: np.ndarray, R: np.ndarray) -> Filter:
         filter_, x, P = _at(_unscented(view, view.angles[sensor][rows]), view, state)
         filter_.sigmas_f = filter_.points_fn.sigma_points(x, P)
         block = np.ascontiguousarray(view.h(sensor, filter_.sigmas_f, u)[:, rows])
@@ -193,7 +198,7 @@ def _update(
     view: View,
     sensor: int,
     y: np.ndarray,
-    step: Callable[..., Any],
+    step: Callable[..., Filter],
     index: int,
     state: np.ndarray,
     work: np.ndarray,
@@ -219,7 +224,7 @@ def _update(
     return verdict
 
 
-def _enkf(view: View) -> Any:
+def _enkf(view: View) -> EnsembleKalmanFilter:
     if "enkf" not in view.kept:
         view.kept["enkf"] = objects().Ensemble(view.nx, ensemble.members(view.options))
     return view.kept["enkf"]
@@ -269,7 +274,7 @@ def predict_enkf(view: View, u: np.ndarray, dt: float, index: int, state: np.nda
 def update_enkf(view: View, u: np.ndarray, sensor: int, y: np.ndarray, *rest: Any) -> int:
     """xᵢ ← xᵢ + K (y + vᵢ - h(xᵢ)), vᵢ ~ N(0, R), with the covariances of the members."""
 
-    def step(state: np.ndarray, rows: np.ndarray, R: np.ndarray) -> Any:
+    def step(state: np.ndarray, rows: np.ndarray, R: np.ndarray) -> Filter:
         X, filter_ = _members(view, state), _enkf(view)
         angles = view.angles[sensor][rows]
         expected = view.h(sensor, X, u)[:, rows]
@@ -284,7 +289,7 @@ def update_enkf(view: View, u: np.ndarray, sensor: int, y: np.ndarray, *rest: An
         filter_.y = nu
         return filter_
 
-    def adopt(view: View, filter_: Any, state: np.ndarray) -> None:
+    def adopt(view: View, filter_: EnsembleKalmanFilter, state: np.ndarray) -> None:
         X = _members(view, state)
         X[:] = filter_.sigmas
         state[-1] += 1.0
@@ -301,7 +306,7 @@ def describe_enkf(view: View, state: np.ndarray, mean: np.ndarray, std: np.ndarr
     cross[:] = P[view.pairs[:, 0], view.pairs[:, 1]]
 
 
-def _entry(name: str, functions: tuple[Any, Any, Any, Any], **other: Any) -> Estimator:
+def _entry(name: str, functions: tuple[Callable, Callable, Callable, Callable], **other: Any) -> Estimator:
     return Estimator(
         name=f"filterpy-{name}",
         title=f"FilterPy's {name.upper()}",

@@ -5,7 +5,7 @@ It wraps the context of compiled filters (compiled/context.py), so that both jud
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from typing import Any
 
@@ -41,7 +41,7 @@ class View:
         tuning: Tuning,
         options: Options,
         pairs: np.ndarray,
-        held: dict[str, Any],
+        held: dict[str, np.ndarray],
     ) -> None:
         """Wrap a context; `held` are the arrays that it points to."""
         model = compiled.model
@@ -105,7 +105,7 @@ class View:
         sensor_jacobian(self.context, sensor, np.ascontiguousarray(x), u, H, self._scratch)
         return H
 
-    def _differences(self, function: Any, x: np.ndarray, circular: np.ndarray) -> np.ndarray:
+    def _differences(self, function: Callable, x: np.ndarray, circular: np.ndarray) -> np.ndarray:
         step = np.diag(CENTRAL_STEP * np.maximum(1.0, np.abs(x)))
         above, below = x + step, x - step
         images = function(np.vstack((above, below)))
@@ -153,7 +153,7 @@ def driven(entry: Estimator) -> Code:
     assert entry.blocks is not None
     members = entry.blocks
 
-    def answering(view: View, X: np.ndarray, answers: np.ndarray) -> Any:
+    def answering(view: View, X: np.ndarray, answers: np.ndarray) -> np.void:
         """The context in which f, or h, of the members X is known; valid for as long as both arrays are."""
         if "answers" not in view.kept:
             p = np.append(view.p, np.zeros(ANSWER))
@@ -176,13 +176,13 @@ def driven(entry: Estimator) -> Code:
         index: int,
         state: np.ndarray,
         work: np.ndarray,
-        *rest: Any,
+        *rest: object,
     ) -> int:
         X = members(view.options, state, view.nx)
         expected = view.h(sensor, X, u)
         return int(update(answering(view, X, expected), u, sensor, y, index, state, work, *rest))
 
-    def within(function: Any) -> Any:
+    def within(function: Callable) -> Callable:
         """The function, called with a view."""
         return lambda view, *given: function(view.context, *given)
 

@@ -23,7 +23,7 @@ from .state_space import LARGE, StateSpaceModel
 from .wrapping import is_derived
 
 
-def place(function: Any, error: BaseException | None = None) -> str:
+def place(function: object, error: BaseException | None = None) -> str:
     """Return file and line of a function, or of the last line in its file that an error passed, as `file:line: `."""
     code = _code(function)
     if code is None:
@@ -80,7 +80,7 @@ def numbers(values: np.ndarray) -> str:
     return f"[{', '.join(f'{value:.4g}' for value in values[:4])}{', …' if values.size > 4 else ''}]"
 
 
-def _remedy(error: Exception, function: Any, takes: str, sizes: str, at: str) -> str:
+def _remedy(error: Exception, function: Callable, takes: str, sizes: str, at: str) -> str:
     """Return the remedy for an error that a function of the model raises at the prior."""
     if isinstance(error, (NameError, AttributeError, ImportError)):
         return "correct the name, or define it in the model's file"
@@ -190,7 +190,7 @@ def _call(
         ) from None
 
 
-def _draws(function: Any, depth: int = 4) -> bool:
+def _draws(function: object, depth: int = 4) -> bool:
     """Return whether a function that can be compiled, or one that it calls, draws random numbers anywhere."""
     code = _code(function)
     if code is None or depth == 0:
@@ -208,7 +208,7 @@ def _draws(function: Any, depth: int = 4) -> bool:
 def probe(model: StateSpaceModel) -> None:
     """Run the plain functions with arrays of the declared sizes, so that an index out of range is an error."""
     values, n = prior_values(model), model.nx
-    known: set[Any] = set()  # code that writes to no argument, which many sensors may share
+    known: set[object] = set()  # code that writes to no argument, which many sensors may share
     calls: list[tuple[str, Callable | None, str, tuple[int, ...]]] = [
         ("f", model.f, "x, u, p, dt", (n,)),
         ("F", model.F, "x, u, p, dt", (n, n)),
@@ -319,7 +319,7 @@ def check_parts(model: StateSpaceModel, f: Callable, h: Sequence[Callable]) -> N
             _check_independent(model, x, u, p, q, dt, rng)
 
 
-def _check_jump(model: StateSpaceModel, x: Any, u: Any, p: Any, q: Any, dt: float) -> None:
+def _check_jump(model: StateSpaceModel, x: np.ndarray, u: np.ndarray, p: np.ndarray, q: np.ndarray, dt: float) -> None:
     assert model.jump is not None
     name = model.jump.state
     c, after = np.full(len(model.jump.modes), np.nan), np.full(model.nx, np.nan)
@@ -344,7 +344,7 @@ def _check_jump(model: StateSpaceModel, x: Any, u: Any, p: Any, q: Any, dt: floa
             raise ModelError(f"model {model.name}: Q acts on the mode {name}, which jumps; leave its row zero")
 
 
-def _away(model: StateSpaceModel, x: Any, states: Any, rng: Any) -> Any:
+def _away(model: StateSpaceModel, x: np.ndarray, states: np.ndarray, rng: np.random.Generator) -> np.ndarray:
     """Return x with other values of some states, far enough that curvature exceeds the rounding of a large mean."""
     other = x.copy()
     reach = model.prior_std[states] + np.abs(model.prior_mean[states])

@@ -179,7 +179,7 @@ def _of_blocks(function: Callable, columns: int | None = None) -> Callable:
     """Return a function of one state as one of a block of states (N, nx), with `columns` results, or nx."""
     inner = as_inner(function)
 
-    def block(X: np.ndarray, *rest: Any) -> np.ndarray:
+    def block(X: np.ndarray, *rest: object) -> np.ndarray:
         out = np.empty((len(X), columns or X.shape[1]))
         for x, row in zip(X, out, strict=True):
             inner(x, *rest, row)

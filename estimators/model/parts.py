@@ -101,7 +101,7 @@ class Field(Sequence[State]):
         axes = [np.arange(n) * step for n, step in zip(self.shape, self.steps, strict=True)]
         return np.stack(np.meshgrid(*axes, indexing="ij"), axis=-1).reshape(len(self), len(self.shape))
 
-    def index(self, value: Any, start: int = 0, stop: int | None = None) -> int:
+    def index(self, value: State, start: int = 0, stop: int | None = None) -> int:
         """Return the index of a state, by its name."""
         return self.index_of(value.name)
 
@@ -167,7 +167,7 @@ class CellNames(Sequence[str]):
             return False
         return True
 
-    def index(self, value: Any, start: int = 0, stop: int | None = None) -> int:
+    def index(self, value: str, start: int = 0, stop: int | None = None) -> int:
         """Return the flat index of a cell by name."""
         return self._field.index_of(value)
 
@@ -179,12 +179,12 @@ MIN_CORRELATION_EIGENVALUE = 1e-9
 """Smallest eigenvalue of a correlation; below it rows repeat each other up to rounding."""
 
 
-def as_correlation(matrix: Any) -> Correlation:
+def as_correlation(matrix: Sequence[Sequence[float]] | np.ndarray) -> Correlation:
     """Return the rows of a matrix, or of anything that NumPy converts to one."""
     return tuple(tuple(float(c) for c in row) for row in np.atleast_2d(np.asarray(matrix, float)))
 
 
-def correlation_of(R: Any) -> Correlation:
+def correlation_of(R: np.ndarray) -> Correlation:
     """Return the correlation c_ij = R_ij / √(R_ii R_jj) of a covariance R (ny, ny)."""
     R = np.asarray(R, float)
     std = np.sqrt(np.diag(R))

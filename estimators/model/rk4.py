@@ -23,7 +23,7 @@ def _inputs_and_parameters(u, p):
     return u, p
 
 
-def rk4(dxdt: Callable[..., Any], constants: Callable[..., Any] = _inputs_and_parameters) -> Callable[..., None]:
+def rk4(dxdt: Callable, constants: Callable = _inputs_and_parameters) -> Callable[..., None]:
     """Return the step `f(x, u, p, dt, out)` of a model with the rates `dxdt`; inputs are held over the step.
 
     Args:

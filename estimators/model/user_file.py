@@ -34,10 +34,10 @@ def _refuse_exit(files: tuple[Path, ...]) -> None:
     _guarded.update(map(str, files))
 
 
-def _guard(function: Callable[..., Any]) -> Callable[..., Any]:
+def _guard(function: Callable) -> Callable:
     process = os.getpid()
 
-    def guarded(*given: Any) -> Any:
+    def guarded(*given: object) -> object:
         if sys._getframe(1).f_code.co_filename in _guarded and os.getpid() == process:
             call = f"os.{function.__name__}({', '.join(map(repr, given))})"
             raise RuntimeError(f"{call} would end the program; a model reports an error by raising an exception")
@@ -161,13 +161,13 @@ class _FromFile:
         self._place = module, name, file, stamp
         self._function = function
 
-    def __call__(self, *given: Any) -> Any:
+    def __call__(self, *given: object) -> object:
         if self._function is None:
             module, name, file, stamp = self._place
             self._function = _named(name, _module(module, file, stamp))
         return self._function(*given)
 
-    def __reduce__(self) -> tuple[Any, ...]:
+    def __reduce__(self) -> tuple[object, ...]:
         module, name, _, _ = self._place
         try:
             same = _named(name, sys.modules[module]) is self._function

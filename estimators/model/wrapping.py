@@ -15,12 +15,12 @@ from typing import Any
 import numpy as np
 
 from ..numerics.helpers import compiled
-from ..numerics.jit import inner, named, plain
+from ..numerics.jit import Inner, inner, named, plain
 from .state_space import StateSpaceModel
 
 
 @lru_cache(maxsize=256)
-def as_inner(function: Callable) -> Any:
+def as_inner(function: Callable) -> Inner:
     """Compile a model's function for a wrapper to call, whose code LLVM copies into that of the wrapper."""
     return compiled(plain(function), {}, forceinline=True)
 

@@ -13,12 +13,13 @@ import itertools
 import os
 import sys
 from pathlib import Path
+from types import FunctionType
 from typing import Any
 
 import numba
 from llvmlite import binding
 from numba import config
-from numba.core import bytecode, caching, codegen, compiler, dispatcher
+from numba.core import base, bytecode, caching, codegen, compiler, dispatcher
 from numba.core.runtime import _nrt_python
 from numba.core.typing import templates
 
@@ -40,7 +41,7 @@ def report_damage(folder: str) -> None:
 class ContentLocator(caching._SourceFileBackedLocatorMixin, caching._CacheLocator):  # type: ignore[misc]
     """Locates the cache of a function by the content of its source file, and by `nisus.` in an installation."""
 
-    def __init__(self, function: Any, file: str) -> None:
+    def __init__(self, function: FunctionType, file: str) -> None:
         path = Path(file).resolve()
         inside = path.is_relative_to(ROOT)
         folder = str(path.parent.relative_to(ROOT)) if inside else self.get_suitable_cache_subpath(file)
@@ -68,13 +69,13 @@ class EntryFiles(caching.IndexDataCacheFile):  # type: ignore[misc]
         self._path_of = os.path.join(cache_path, f"{filename_base}.{{}}.nbc").format
         self._valid = ENTRY_FORMAT, numba.__version__, source_stamp
 
-    def _path(self, key: Any) -> Path:
+    def _path(self, key: object) -> Path:
         return Path(self._path_of(hashlib.sha256(repr(key).encode()).hexdigest()[:16]))
 
-    def _purpose(self, key: Any) -> bytes:
+    def _purpose(self, key: object) -> bytes:
         return hashlib.sha256(repr((self._valid, key)).encode()).digest()
 
-    def __contains__(self, key: Any) -> bool:
+    def __contains__(self, key: object) -> bool:
         """Return whether there is an entry of the present source, which takes a tenth of a millisecond."""
         try:
             with self._path(key).open("rb") as file:
@@ -82,13 +83,13 @@ class EntryFiles(caching.IndexDataCacheFile):  # type: ignore[misc]
         except OSError:
             return False
 
-    def save(self, key: Any, data: Any) -> None:
+    def save(self, key: object, data: object) -> None:
         """Save compiled code; of two processes that compiled the same, the last."""
         content = self._dump((key, data))
         with self._open_for_write(str(self._path(key))) as file:
             file.write(self._purpose(key) + hashlib.sha256(content).digest() + content)
 
-    def load(self, key: Any) -> Any:
+    def load(self, key: object) -> object:
         """Return compiled code, None if there is none. A damaged file is reported and deleted."""
         path = self._path(key)
         try:
@@ -122,7 +123,7 @@ class EntryLibrary(codegen.JITCodeLibrary):  # type: ignore[misc]
     _bitcode: bytes | None = None
 
     @classmethod
-    def _unserialize(cls, codegen: Any, state: Any) -> Any:
+    def _unserialize(cls, codegen: codegen.JITCPUCodegen, state: tuple) -> EntryLibrary:
         name, _, (code, bitcode) = state
         library = codegen.create_library(name) if code else LinkedLibrary(codegen, name)
         library._bitcode = bitcode
@@ -134,7 +135,7 @@ class EntryLibrary(codegen.JITCodeLibrary):  # type: ignore[misc]
         library._finalize_final_module()
         return library
 
-    def _get_module_for_linking(self) -> Any:
+    def _get_module_for_linking(self) -> binding.ModuleRef:
         if self._bitcode is not None:
             self._shared_module, self._bitcode = binding.parse_bitcode(self._bitcode), None
             self._codegen._engine._load_defined_symbols(self._shared_module)
@@ -148,11 +149,11 @@ class LinkedLibrary(EntryLibrary):
     """
 
     @property
-    def codegen(self) -> Any:
+    def codegen(self) -> LinkedLibrary:
         """Receiver of the environment of the function, which exceptions alone need."""
         return self
 
-    def set_env(self, name: str, environment: Any) -> None:
+    def set_env(self, name: str, environment: object) -> None:
         """Do nothing, see `codegen`."""
 
     def get_pointer_to_function(self, name: str) -> int:
@@ -171,7 +172,7 @@ class LinkedLibrary(EntryLibrary):
         """Return what `EntryLibrary` reads."""
         return self.name, "object", (b"", self._get_module_for_linking().as_bitcode())
 
-    def _get_module_for_linking(self) -> Any:
+    def _get_module_for_linking(self) -> binding.ModuleRef:
         if self._bitcode is not None:
             self._shared_module, self._bitcode = binding.parse_bitcode(self._bitcode), None
         return super()._get_module_for_linking()
@@ -180,7 +181,7 @@ class LinkedLibrary(EntryLibrary):
 class Linked(compiler.Compiler):  # type: ignore[misc]
     """Compiles a function that only compiled functions call."""
 
-    def compile_extra(self, func: Any) -> Any:
+    def compile_extra(self, func: FunctionType) -> compiler.CompileResult:
         """Compile into a `LinkedLibrary`, without wrappers for Python and C."""
         self.state.flags.no_cpython_wrapper = self.state.flags.no_cfunc_wrapper = True
         self.state.library = LinkedLibrary(self.state.targetctx.codegen(), func.__qualname__)
@@ -190,7 +191,7 @@ class Linked(compiler.Compiler):  # type: ignore[misc]
 class EntryResults(caching.CompileResultCacheImpl):  # type: ignore[misc]
     """Compiled functions from entries."""
 
-    def rebuild(self, target_context: Any, payload: Any) -> Any:
+    def rebuild(self, target_context: base.BaseContext, payload: tuple) -> compiler.CompileResult:
         """Return a compiled function; some have no wrapper for Python."""
         (_, _, (code, _)), described, *_ = payload
         if not code:
@@ -223,10 +224,10 @@ class FunctionEntries(caching.FunctionCache):  # type: ignore[misc]
     linked = False
     """Whether the entries are bitcode alone, see `Linked`."""
 
-    def __init__(self, function: Any) -> None:
+    def __init__(self, function: FunctionType) -> None:
         self._py_func = function
 
-    def _index_key(self, sig: Any, codegen: Any) -> tuple[Any, ...]:
+    def _index_key(self, sig: object, codegen: object) -> tuple[object, ...]:
         """Return the key of an entry, which of one function differs for the two kinds."""
         return (*super()._index_key(sig, codegen), self.linked)
 
@@ -236,7 +237,7 @@ class FunctionEntries(caching.FunctionCache):  # type: ignore[misc]
         super().__init__(self._py_func)
         return getattr(self, name)
 
-    def load_overload(self, sig: Any, target_context: Any) -> Any:
+    def load_overload(self, sig: object, target_context: base.BaseContext) -> compiler.CompileResult | None:
         """Return a compiled function, None if it is not in the cache."""
         _declare_runtime()
         with self._guard_against_spurious_io_errors():

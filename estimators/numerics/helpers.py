@@ -66,7 +66,7 @@ def compiled(helper: Any, known: dict[Any, Any], forceinline: bool = False) -> A
     return known[helper]
 
 
-def _plain(item: Any) -> bool:
+def _plain(item: object) -> bool:
     if not isinstance(item, FunctionType) or item.__module__ == plain.__module__:
         # Those of jit.py Numba knows, some by an implementation of its own.
         return False
@@ -84,7 +84,7 @@ def _names(code: CodeType) -> Iterator[str]:
 def source_digest(helpers: list[Any]) -> str:
     """Return a digest of helpers and all their callees: their sources, enclosed values and defaults."""
     digest = hashlib.sha256()
-    seen: list[Any] = []
+    seen: list[object] = []
     while helpers:
         helper = helpers.pop()
         if helper in seen:

@@ -15,9 +15,12 @@ from uuid import NAMESPACE_OID, uuid5
 
 import numba
 import numpy as np
+from llvmlite.ir import IRBuilder, Value
 from numba import carray, njit, types
 from numba.core import cgutils
+from numba.core.base import BaseContext
 from numba.core.registry import CPUDispatcher
+from numba.core.typing import Signature
 from numba.experimental.function_type import _get_jit_address
 from numba.extending import intrinsic, lower_builtin, overload, register_jitable
 
@@ -65,7 +68,7 @@ class Inner(CPUDispatcher):  # type: ignore[misc]
         return self.py_func(*args, **kwargs)
 
 
-def inner(function: Callable[..., Any], forceinline: bool = False) -> Any:
+def inner(function: Callable, forceinline: bool = False) -> Inner:
     """`jit` for what functions of a model call: without machine code of its own that takes a third less time."""
     made = jit(pipeline_class=Linked, forceinline=forceinline)(function)
     made.__class__, made._cache.linked = Inner, True
@@ -78,17 +81,17 @@ class TwoForms(CPUDispatcher):  # type: ignore[misc]
     forceinline = False
 
     @cached_property
-    def linked(self) -> Any:
+    def linked(self) -> Inner:
         """What compiled callers link, see `Linked`."""
         return inner(self.py_func, self.forceinline)
 
     @property
-    def _numba_type_(self) -> Any:
+    def _numba_type_(self) -> types.Type:
         """Type of the function for a compiled caller."""
         return self.linked._numba_type_
 
 
-def linkable(function: Callable[..., Any], forceinline: bool = False) -> Any:
+def linkable(function: Callable, forceinline: bool = False) -> Any:
     """`jit` for functions of filters that Python calls, too, or tests do: each form is compiled when first needed."""
     made = jit(function)
     made.__class__, made.forceinline = TwoForms, forceinline
@@ -112,7 +115,7 @@ class AddressOnly(CPUDispatcher):  # type: ignore[misc]
         raise TypeError(f"{self.__name__} is called by compiled code only; call its `py_func` from Python")
 
 
-def by_address(function: Callable[..., Any]) -> Any:
+def by_address(function: Callable) -> AddressOnly:
     """`jit` for functions that are called only by compiled code or through their address.
 
     Not for a function that is also compiled by `jit`, as the cache does not distinguish the two.
@@ -122,13 +125,13 @@ def by_address(function: Callable[..., Any]) -> Any:
     return made
 
 
-part: Callable[[Callable[..., Any]], Any] = register_jitable(
+part: Callable[[Callable], Any] = register_jitable(
     cache=True, nogil=True, error_model="numpy", forceinline=False, pipeline_class=Linked
 )
 """`jit` for functions that only compiled functions call, without the wrapper for Python, which takes a third of the
 compile time. Called from Python, the function runs as plain Python."""
 
-embedded: Callable[[Callable[..., Any]], Any] = register_jitable(
+embedded: Callable[[Callable], Any] = register_jitable(
     cache=True, nogil=True, error_model="numpy", forceinline=True, pipeline_class=Linked
 )
 """`part` for a long helper in the steps of several filters: compiled once, and copied into each caller by LLVM.
@@ -136,7 +139,7 @@ embedded: Callable[[Callable[..., Any]], Any] = register_jitable(
 `inlined` would compile it again in each caller; for a short helper that is cheaper than a unit of its own."""
 
 
-def named(made: Any) -> Any:
+def named(made: CPUDispatcher) -> CPUDispatcher:
     """Give a compiled function of a module an identifier made from its name.
 
     Numba distinguishes closures by their content, a compiled function by its code and an identifier that is random in
@@ -146,22 +149,22 @@ def named(made: Any) -> Any:
     return made
 
 
-def inlined(function: Callable[..., Any]) -> Any:
+def inlined(function: Callable) -> CPUDispatcher:
     """`jit` for helpers inside a filter's step, where a call that hands over context and arrays costs 50 to 100 ns."""
     return named(jit(function, inline="always"))
 
 
-def inner_embedded(function: Callable[..., Any]) -> Any:
+def inner_embedded(function: Callable) -> Inner:
     """`inner` for what such functions of a module call: it is copied into its compiled callers, as with `embedded`."""
     return named(inner(function, forceinline=True))
 
 
-def plain(function: Any) -> Callable[..., Any]:
+def plain(function: Any) -> Callable:
     """Return the Python function of a compiled one; any other function unchanged."""
     return getattr(function, "py_func", function)  # type: ignore[no-any-return]
 
 
-def address(dispatcher: Any, signature: Any) -> int:
+def address(dispatcher: CPUDispatcher, signature: Signature) -> int:
     """Compile `dispatcher` for `signature` (or load it from the cache) and return where its machine code starts.
 
     The dispatcher must be kept alive for as long as the address is used. Threads are loaded first: code from the cache
@@ -172,13 +175,13 @@ def address(dispatcher: Any, signature: Any) -> int:
     return int(_get_jit_address(dispatcher, signature))
 
 
-def caller(signature: Any) -> Any:
+def caller(signature: Signature) -> Any:
     """Return a function for compiled code, `call(address, *args)`, which calls the function at `address`."""
     args, result = signature.args, signature.return_type
 
     @intrinsic
-    def call(typing_context: Any, target: Any, *values: Any) -> Any:
-        def codegen(context: Any, builder: Any, _: Any, given: Any) -> Any:
+    def call(typing_context: object, target: types.Type, *values: types.Type) -> tuple[Signature, Callable]:
+        def codegen(context: BaseContext, builder: IRBuilder, _: Signature, given: list[Value]) -> Value:
             function_type = context.call_conv.get_function_type(result, args)
             pointer = builder.inttoptr(given[0], function_type.as_pointer())
             unpacked = cgutils.unpack_tuple(builder, given[1], len(args))
@@ -192,12 +195,12 @@ def caller(signature: Any) -> Any:
     return call
 
 
-def pointer(kind: Any) -> Any:
+def pointer(kind: types.Type) -> Any:
     """Return a function for compiled code that reads an integer as an address, that of a pointer or a record."""
 
     @intrinsic
-    def read(typing_context: Any, target: Any) -> Any:
-        def codegen(context: Any, builder: Any, signature: Any, given: Any) -> Any:
+    def read(typing_context: object, target: types.Type) -> tuple[Signature, Callable]:
+        def codegen(context: BaseContext, builder: IRBuilder, signature: Signature, given: list[Value]) -> Value:
             return builder.inttoptr(given[0], context.get_value_type(signature.return_type))
 
         return kind(i64), codegen
@@ -260,10 +263,10 @@ def complexes(scratch, start, n):
 
 
 @intrinsic
-def _on_stack(typing_context: Any, like: Any, entries: Any) -> Any:
+def _on_stack(typing_context: object, like: types.Type, entries: types.Type) -> tuple[Signature, Callable]:
     """Return the address of room on the stack for as many numbers of the kind of `like` as a tuple has entries."""
 
-    def codegen(context: Any, builder: Any, signature: Any, given: Any) -> Any:
+    def codegen(context: BaseContext, builder: IRBuilder, signature: Signature, given: list[Value]) -> Value:
         return cgutils.alloca_once(builder, context.get_data_type(like), size=max(1, entries.count))
 
     return types.CPointer(like)(like, entries), codegen
@@ -286,10 +289,10 @@ def _stack_vector(like: Any, entries: Any) -> Any:
 
 
 @intrinsic
-def _data_of(typing_context: Any, array: Any) -> Any:
+def _data_of(typing_context: object, array: types.Array) -> tuple[Signature, Callable]:
     """Return a pointer to the first element of an array."""
 
-    def codegen(context: Any, builder: Any, signature: Any, given: Any) -> Any:
+    def codegen(context: BaseContext, builder: IRBuilder, signature: Signature, given: list[Value]) -> Value:
         return context.make_array(array)(context, builder, given[0]).data
 
     return types.CPointer(array.dtype)(array), codegen
@@ -305,7 +308,7 @@ def borrowed(array):
 
 
 @lower_builtin(operator.truediv, types.complex128, types.complex128)
-def _divide_complex(context: Any, builder: Any, signature: Any, given: Any) -> Any:
+def _divide_complex(context: BaseContext, builder: IRBuilder, signature: Signature, given: list[Value]) -> Value:
     """Divide as Numba does, but give NaN for a zero divisor.
 
     Numba raises ZeroDivisionError there in every error model, from a derivative of f or h in the middle of a fold. As

@@ -7,9 +7,8 @@ reordering sums; so results are the same bits on every run.
 
 from __future__ import annotations
 
-from typing import Any
-
 import numpy as np
+from numpy.typing import ArrayLike
 
 from .jit import embedded, inlined, jit, part
 from .simd_ir import LANES
@@ -306,7 +305,7 @@ def mirror(P):
             P[j, i] = P[i, j]
 
 
-def wrapped(angle: np.ndarray, circular: Any = True) -> np.ndarray:
+def wrapped(angle: np.ndarray, circular: ArrayLike = True) -> np.ndarray:
     """Return numbers of which those that are `circular` are brought to [-π, π)."""
     with np.errstate(invalid="ignore"):  # of numbers that are not finite
         return np.where(circular, (angle + np.pi) % (2.0 * np.pi) - np.pi, angle)

@@ -9,12 +9,11 @@ sequential forecasts by it; Smith (1985), doi:10.1002/for.3980040305, for the st
 from __future__ import annotations
 
 import math
-from typing import Any
 
 import numpy as np
 
 from .jit import inlined, jit
-from .simd_ir import Lanes, exponential, in_vectors, integer, vector_code
+from .simd_ir import Lanes, Value, exponential, in_vectors, integer, vector_code
 
 FURTHEST = 8.0
 """|e| at most: a probability of 6e-16, beyond which no prediction means what it says."""
@@ -127,7 +126,7 @@ _POLYNOMIAL = (
 Form after Shepherd & Laframboise (1981), doi:10.1090/S0025-5718-1981-0595058-X."""
 
 
-def _beyond(v: Lanes, z: Any) -> Any:
+def _beyond(v: Lanes, z: Value) -> Value:
     """Return Φ(-z) for z ≥ 0, within 2e-8 of the value."""
     builder, number = v.builder, v.constant
     z = builder.select(builder.fcmp_ordered(">", z, number(_MAX_TAIL_Z)), number(_MAX_TAIL_Z), z)
@@ -150,7 +149,7 @@ def add_tails(v, n, d, shift, scale, w, tails):
     numbers = [builder.gep(tails.data, [integer(k)]) for k in range(2)]
     sums = [v.variable() for _ in range(2)]
 
-    def add(v: Lanes, i: Any) -> None:
+    def add(v: Lanes, i: Value) -> None:
         weight, zero = v.load(w.data, i), v.constant(0.0)
         z = builder.fmul(v.spread(scale), builder.fadd(v.load(d.data, i), v.spread(shift)))
         positive = builder.fcmp_ordered(">", z, zero)

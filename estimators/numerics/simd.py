@@ -11,19 +11,19 @@ and 765 for 4,270.
 from __future__ import annotations
 
 import math
-from typing import Any
+from collections.abc import Callable
 
 from numba import types
 from numba.core import cgutils
 
 from .jit import inlined
-from .simd_ir import LANES, Lanes, exponential, in_vectors, integer, sizes, sum_in_vectors, vector_code
+from .simd_ir import LANES, Lanes, Value, exponential, in_vectors, integer, sizes, sum_in_vectors, vector_code
 
 WIDE = 32
 """Columns that `combine_rows` and `spread_rows` do at a time: four vectors, which stay in registers."""
 
 
-def _by_columns(v: Lanes, columns: Any, write: Any) -> None:
+def _by_columns(v: Lanes, columns: Value, write: Callable[[list[Value]], None]) -> None:
     """Write code for blocks of `WIDE` columns and for blocks of `LANES`: write(first columns of the vectors)."""
     wide = v.builder.icmp_signed("==", columns, integer(WIDE))
     with v.builder.if_else(wide) as (then, otherwise):
@@ -37,7 +37,7 @@ def combine_rows(v, weights, count, rows, out):
     """out = Σ_k weights[k] rows[k], k < count, over the columns of `rows`, which are `WIDE` or `LANES`."""
     builder, columns = v.builder, sizes(v.builder, rows)[1]
 
-    def write(vectors: list[Any]) -> None:
+    def write(vectors: list[Value]) -> None:
         sums = [v.variable() for _ in vectors]
         with cgutils.for_range(builder, count) as loop:
             weight = v.entry(weights.data, loop.index)
@@ -55,7 +55,7 @@ def spread_rows(v, weights, count, x, rows):
     """rows[k] += weights[k] x, k < count, over the columns of `rows`, which are `WIDE` or `LANES`."""
     builder, columns = v.builder, sizes(v.builder, rows)[1]
 
-    def write(vectors: list[Any]) -> None:
+    def write(vectors: list[Value]) -> None:
         values = [v.load(x.data, at) for at in vectors]
         with cgutils.for_range(builder, count) as loop:
             weight = v.entry(weights.data, loop.index)
@@ -70,7 +70,7 @@ def spread_rows(v, weights, count, x, rows):
 def add_scaled(v, n, a, x, y):
     """y[:n] += a x[:n]."""
 
-    def add(v: Lanes, i: Any) -> None:
+    def add(v: Lanes, i: Value) -> None:
         v.store(v.multiply_add(v.spread(a), v.load(x.data, i), v.load(y.data, i)), y.data, i)
 
     in_vectors(v, n, add)
@@ -98,7 +98,7 @@ def added(v, n, x, y, out):
 def weigh_squares(v, n, e, weight, shift, log_w, out):
     """log_w[:n] -= weight e[:n]², and out[:n] = e[:n] - shift, which may be e."""
 
-    def write(v: Lanes, i: Any) -> None:
+    def write(v: Lanes, i: Value) -> None:
         builder, own = v.builder, v.load(e.data, i)
         square = builder.fmul(builder.fmul(v.spread(weight), own), own)
         v.store(builder.fsub(v.load(log_w.data, i), square), log_w.data, i)
@@ -113,7 +113,7 @@ def square_roots(v, n, x, out):
     in_vectors(v, n, lambda v, i: v.store(v.unary("sqrt", v.load(x.data, i)), out.data, i))
 
 
-def _combining(rows: int, subtract: bool = False) -> Any:
+def _combining(rows: int, subtract: bool = False) -> Callable:
     @vector_code()
     def combine(v, count, weights, apart, x, stride, n, out, width):
         """out[i·width :][:n] = Σ_k weights[k·apart + i] x[k·stride :][:n], k < count, for i < rows: 1 or 4.
@@ -121,7 +121,7 @@ def _combining(rows: int, subtract: bool = False) -> Any:
         A subtraction takes the sum from out, term by term.
         """
 
-        def write(v: Lanes, at: Any) -> None:
+        def write(v: Lanes, at: Value) -> None:
             builder = v.builder
             to = [builder.gep(out.data, [builder.mul(width, integer(i))]) for i in range(rows)]
             sums = [v.variable(v.load(row, at) if subtract else None) for row in to]
@@ -147,7 +147,7 @@ subtract_one, subtract_four = _combining(1, subtract=True), _combining(4, subtra
 def add_outer(v, rows, n, a, left, x, right, y, z, stride):
     """z[k·stride :][:n] += a (left[k] x[:n] + right[k] y[:n]) for k < rows."""
 
-    def write(v: Lanes, i: Any) -> None:
+    def write(v: Lanes, i: Value) -> None:
         builder = v.builder
         own_x, own_y = (builder.fmul(v.spread(a), v.load(vector.data, i)) for vector in (x, y))
         with cgutils.for_range(builder, rows) as loop:
@@ -162,7 +162,7 @@ def add_outer(v, rows, n, a, left, x, right, y, z, stride):
 def rotate(v, n, c, s, x, y):
     """x[:n], y[:n] = c x - s y, s x + c y."""
 
-    def write(v: Lanes, i: Any) -> None:
+    def write(v: Lanes, i: Value) -> None:
         builder = v.builder
         cosine, sine, a, b = v.spread(c), v.spread(s), v.load(x.data, i), v.load(y.data, i)
         v.store(v.multiply_add(cosine, a, builder.fneg(builder.fmul(sine, b))), x.data, i)
@@ -187,7 +187,7 @@ def dot(v, n, a, b):
 def weighted(v, n, w, x, out):
     """out[:n] = w[:n] x[:n]; return Σ out[:n]."""
 
-    def add(v: Lanes, i: Any, sums: Any) -> None:
+    def add(v: Lanes, i: Value, sums: Value) -> None:
         value = v.builder.fmul(v.load(w.data, i), v.load(x.data, i))
         v.store(value, out.data, i)
         v.add_to(sums, value)
@@ -199,7 +199,7 @@ def weighted(v, n, w, x, out):
 def exp_minus(v, n, x, shift, out):
     """out[:n] = e^(x[:n] - shift), within a unit in the last place; 0 where it is below the normal numbers."""
 
-    def write(v: Lanes, i: Any) -> None:
+    def write(v: Lanes, i: Value) -> None:
         v.store(exponential(v, v.builder.fsub(v.load(x.data, i), v.spread(shift))), out.data, i)
 
     in_vectors(v, n, write)

@@ -9,9 +9,8 @@ Source: Golub & Van Loan, Matrix Computations, 4th ed., algorithm 8.3.1 (Househo
 from __future__ import annotations
 
 from collections.abc import Callable
-from typing import Any
 
-from .simd_ir import LANES, Lanes, integer, steps, vector_code
+from .simd_ir import LANES, Array, Lanes, Value, integer, steps, vector_code
 
 NOTHING = 1e-300
 """Below this a sum of squares may have lost its numbers to underflow: a row that small is zero."""
@@ -20,20 +19,20 @@ NOTHING = 1e-300
 class LaneRows:
     """Rows of `LANES` numbers of an array."""
 
-    def __init__(self, v: Lanes, array: Any) -> None:
+    def __init__(self, v: Lanes, array: Array) -> None:
         self.v, self.data = v, array.data
 
-    def _at(self, row: Any) -> Any:
+    def _at(self, row: Value) -> Value:
         return self.v.builder.mul(row, integer(LANES))
 
-    def __getitem__(self, row: Any) -> Any:
+    def __getitem__(self, row: Value) -> Value:
         return self.v.load(self.data, self._at(row))
 
-    def __setitem__(self, row: Any, value: Any) -> None:
+    def __setitem__(self, row: Value, value: Value) -> None:
         self.v.store(value, self.data, self._at(row))
 
 
-def _tiled(v: Lanes, begin: Any, end: Any, height: int, body: Callable[[Any, int], None]) -> None:
+def _tiled(v: Lanes, begin: Value, end: Value, height: int, body: Callable[[Value, int], None]) -> None:
     """Write body(i, height) for groups of so many numbers from `begin` on, and body(i, 1) for the rest before `end`."""
     builder = v.builder
     middle = builder.add(begin, builder.and_(builder.sub(end, begin), integer(-height)))
@@ -43,12 +42,12 @@ def _tiled(v: Lanes, begin: Any, end: Any, height: int, body: Callable[[Any, int
         body(i, 1)
 
 
-def _sums(v: Lanes, begin: Any, end: Any, terms: Callable[[Any], list[tuple[Any, Any]]], count: int) -> list[Any]:
+def _sums(v: Lanes, begin: Value, end: Value, terms: Callable[[Value], list[tuple]], count: int) -> list[Value]:
     """Return `count` sums over i of products: terms(i) returns their factors. Four numbers i at a time."""
     builder = v.builder
     parts = [[v.variable() for _ in range(4)] for _ in range(count)]
 
-    def add(i: Any, height: int) -> None:
+    def add(i: Value, height: int) -> None:
         for k in range(height):
             for own, (a, b) in zip(parts, terms(builder.add(i, integer(k))), strict=True):
                 v.multiply_add_to(own[k], a, b)
@@ -91,7 +90,7 @@ def multiply(v, n, k, A, w):
     with steps(builder, first, n) as i:
         w[i] = v.constant(0.0)
 
-    def tile(i: Any, height: int) -> None:
+    def tile(i: Value, height: int) -> None:
         rows = [builder.add(i, integer(r)) for r in range(height)]
         bases = [builder.mul(r, n) for r in rows]
         own = [A[builder.add(row, r)] for r in rows]
@@ -122,12 +121,12 @@ def subtract(v, n, k, A, q):
     A, q = LaneRows(v, A), LaneRows(v, q)
     row = builder.mul(k, n)
 
-    def tile(i: Any, height: int) -> None:
+    def tile(i: Value, height: int) -> None:
         rows = [builder.add(i, integer(r)) for r in range(height)]
         bases = [builder.mul(r, n) for r in rows]
         left = [(builder.fneg(A[builder.add(row, r)]), builder.fneg(q[r])) for r in rows]
 
-        def change(base: Any, pair: Any, j: Any, own: Any, other: Any) -> None:
+        def change(base: Value, pair: tuple[Value, Value], j: Value, own: Value, other: Value) -> None:
             at = builder.add(base, j)
             A[at] = v.multiply_add(pair[1], own, v.multiply_add(pair[0], other, A[at]))
 
@@ -149,7 +148,7 @@ def reflect(v, n, k, A, inverses, w, b, g):
     A, inverses, w, b, g = (LaneRows(v, array) for array in (A, inverses, w, b, g))
     row, first, inverse = builder.mul(k, n), builder.add(k, integer(1)), inverses[k]
 
-    def terms(i: Any) -> list[tuple[Any, Any]]:
+    def terms(i: Value) -> list[tuple[Value, Value]]:
         own = A[builder.add(row, i)]
         return [(own, w[i]), (own, b[i]), (own, g[i])]
 
@@ -203,7 +202,7 @@ def scale_rows(v, count, own, near, roots, C, d, t, at, G, b, g):
     roots, G, b, g = (LaneRows(v, array) for array in (roots, G, b, g))
     width, columns = (builder.extract_value(array.shape, 1) for array in (C, t))
 
-    def index(i: Any) -> tuple[Any, Any]:
+    def index(i: Value) -> tuple[Value, Value]:
         row = builder.load(builder.gep(own.data, [i]))
         return row, builder.load(builder.gep(near.data, [row]))
 
@@ -223,7 +222,7 @@ def weighted_gram(v, count, own, tapers, Z, n, G):
     tapers, G = LaneRows(v, tapers), LaneRows(v, G)
     width = builder.extract_value(Z.shape, 1)
 
-    def tile(i: Any, j: Any, height: int, across: int) -> None:
+    def tile(i: Value, j: Value, height: int, across: int) -> None:
         sums = [[v.variable() for _ in range(across)] for _ in range(height)]
         with steps(builder, 0, count) as k:
             row = builder.gep(Z.data, [builder.mul(builder.load(builder.gep(own.data, [k])), width)])

@@ -12,12 +12,11 @@ from __future__ import annotations
 
 import functools
 import math
-from typing import Any
 
 from numba import types
 from numba.core import cgutils
 
-from .simd_ir import I64, LANES, Lanes, integer, sizes, steps, vector_code
+from .simd_ir import I64, LANES, Array, Lanes, Value, integer, sizes, steps, vector_code
 
 
 @vector_code()
@@ -33,7 +32,7 @@ def centre(v, D, k, w, mean):
     with steps(builder, 0, width, LANES) as at:
         own = v.first(builder.sub(k, at))
 
-        def load(row: Any) -> Any:
+        def load(row: Value) -> Value:
             return builder.select(own, v.load(row, at), v.constant(0.0))
 
         central = load(x)
@@ -48,7 +47,7 @@ def centre(v, D, k, w, mean):
         v.store(builder.fsub(v.constant(0.0), shift), x, at)
 
 
-def _product(v: Lanes, n: Any, rows: Any, A: Any, B: Any, first: Any, w: Any, out: Any) -> None:
+def _product(v: Lanes, n: Value, rows: Value, A: Array, B: Array, first: Value, w: Value, out: Array) -> None:
     """Write out (n, columns) = first A₀ᵀ B₀ + w Σ_r A_rᵀ B_r over the rows A_r (n or more) and B_r (whole vectors).
 
     Where A is B it is symmetric to the last bit.
@@ -58,10 +57,10 @@ def _product(v: Lanes, n: Any, rows: Any, A: Any, B: Any, first: Any, w: Any, ou
     first, weight = v.spread(first), v.spread(w)
     sums = [v.variable() for _ in range(4)]
 
-    def entries(row: Any, i: Any, count: int) -> list[Any]:
+    def entries(row: Value, i: Value, count: int) -> list[Value]:
         return [v.entry(row, builder.add(i, integer(k))) for k in range(count)]
 
-    def tile(i: Any, at: Any, count: int) -> None:
+    def tile(i: Value, at: Value, count: int) -> None:
         """Rows i, …, i + count - 1 of one vector's columns."""
         mine = sums[:count]
         for one in mine:
@@ -175,7 +174,9 @@ def spread_points(v, x, U, spread, points):
             v.store(builder.fsub(centre, d), points.data, builder.add(to, half))
 
 
-def _multiply(v: Lanes, A: Any, rows: Any, count: Any, B: Any, base: Any, out: Any, lower: Any) -> None:
+def _multiply(
+    v: Lanes, A: Array, rows: Value, count: Value, B: Array, base: Array | None, out: Array, lower: Value
+) -> None:
     """Write out = A B, or base - A B, in blocks of four rows and one or two vectors that stay in registers.
 
     The last block of rows and of columns overlaps the one before it instead of being shorter.
@@ -183,15 +184,15 @@ def _multiply(v: Lanes, A: Any, rows: Any, count: Any, B: Any, base: Any, out: A
     builder = v.builder
     lower = builder.icmp_signed("!=", lower, integer(0))
 
-    def least(a: Any, b: Any) -> Any:
+    def least(a: Value, b: Value) -> Value:
         return builder.select(builder.icmp_signed("<", a, b), a, b)
 
     n = least(sizes(builder, B)[1], sizes(builder, out)[1])
 
-    def row_of(array: Any, row: Any) -> Any:
+    def row_of(array: Array, row: Value) -> Value:
         return builder.gep(array.data, [builder.mul(row, sizes(builder, array)[1])])
 
-    def block(i: Any, at: Any, height: int, vectors: int) -> None:
+    def block(i: Value, at: Value, height: int, vectors: int) -> None:
         columns = [builder.add(at, integer(LANES * c)) for c in range(vectors)]
         rows = [builder.add(i, integer(r)) for r in range(height)]
         left = [row_of(A, row) for row in rows]

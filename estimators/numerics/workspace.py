@@ -24,10 +24,10 @@ from collections.abc import Callable
 from typing import Any, NamedTuple
 
 import numpy as np
-from numba import carray
+from numba import carray, types
 from numba.extending import intrinsic, overload, register_jitable
 
-from .jit import _to_float, _to_int, floats, i64, jit, plain
+from .jit import BaseContext, IRBuilder, Signature, Value, _to_float, _to_int, floats, i64, jit, plain
 
 WORD = 8
 """Bytes of a float64."""
@@ -61,9 +61,7 @@ def take_integers(at: int, n: int) -> tuple[Any, int]:
 _TAKES = (take_matrix, take_vector, take_integers)
 
 
-def declare_layout(
-    kind: str, sizes: str, /, *functions: Callable[..., Any], **fields: str
-) -> tuple[Any, Callable[..., Any]]:
+def declare_layout(kind: str, sizes: str, /, *functions: Callable, **fields: str) -> tuple[Any, Callable]:
     """Return a named tuple and the layout `(at, *sizes)` that fills it with arrays that stand one after the other.
 
     Args:
@@ -127,16 +125,16 @@ def _take_integers(at, n):
 
 
 @intrinsic
-def start_of(typing_context: Any, work: Any) -> Any:
+def start_of(typing_context: object, work: types.Array) -> tuple[Signature, Callable]:
     """Return the address at which a scratch array begins (NumPy's `ctypes` takes longer to compile)."""
 
-    def codegen(context: Any, builder: Any, signature: Any, given: Any) -> Any:
+    def codegen(context: BaseContext, builder: IRBuilder, signature: Signature, given: list[Value]) -> Value:
         return builder.ptrtoint(context.make_array(work)(context, builder, given[0]).data, context.get_value_type(i64))
 
     return i64(work), codegen
 
 
-def size_of(workspace: Callable[..., Any], *sizes: int) -> int:
+def size_of(workspace: Callable, *sizes: int) -> int:
     """How many float64s a workspace of these sizes takes; its last field is where it ends."""
     return int(plain(workspace)(0, *sizes)[-1]) // WORD
 

@@ -13,7 +13,6 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from functools import lru_cache
-from typing import Any
 
 import numpy as np
 from numba import prange, types
@@ -109,9 +108,7 @@ def block_of(context, shared, b):
     return block_at(start_of(shared.blocks[b]), context.nx, context.width)
 
 
-def work_sized(
-    room_at: Callable[..., Any], own: Callable[[int], int] = lambda nx: 0
-) -> Callable[[Options, int, int], int]:
+def work_sized(room_at: Callable, own: Callable[[int], int] = lambda nx: 0) -> Callable[[Options, int, int], int]:
     """Return the `work_size` of a filter: the cloud's scratch, `own(nx)` numbers a member, a room for each block."""
 
     def size(options: Options, nx: int, ny: int) -> int:
@@ -216,7 +213,7 @@ def commit_block(context, u, dt, sensor, y, key, value, state, work, number):
         log_w[i] = joint[i] - value
 
 
-def phases(*own: Any) -> Callable[[StateSpaceModel, Options], np.ndarray]:
+def phases(*own: Callable) -> Callable[[StateSpaceModel, Options], np.ndarray]:
     """Return `prepare` of a filter with these phases of its own, numbered from `OWN` on: their addresses."""
 
     @lru_cache(maxsize=1)

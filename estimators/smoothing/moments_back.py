@@ -9,7 +9,7 @@ Sources: Rauch, Tung & Striebel (1965), doi:10.2514/3.3166; Särkkä, Bayesian F
 
 from __future__ import annotations
 
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 from numba import types
@@ -29,7 +29,7 @@ from ..fold_kernel import advance_to, asks
 from ..gaussian.shared import tell
 from ..interpreted.fold_loop import UNSET
 from ..log import INPUT, RESET
-from ..numerics.jit import B1, F1, F2, I1, borrowed, i64, inlined, jit
+from ..numerics.jit import B1, F1, F2, I1, CPUDispatcher, borrowed, i64, inlined, jit
 from ..numerics.linalg import copy, copy_vector
 from ..numerics.workspace import size_of
 from ..snapshots import Snapshot
@@ -53,8 +53,8 @@ NOWHERE = -(2**63)  # In place of the time of the event after a query: there is 
 class Moments(NamedTuple):
     """A mean (n,) and a covariance (n, n)."""
 
-    x: Any
-    P: Any
+    x: np.ndarray
+    P: np.ndarray
 
 
 @inlined
@@ -231,7 +231,7 @@ _moments = types.NamedTuple((F1, F2), Moments)
 _step = types.NamedTuple((F1, F1, F1, F2, F2, F1, i64), StepNote)
 
 
-PIECES: tuple[tuple[Any, tuple[Any, ...]], ...] = (
+PIECES: tuple[tuple[CPUDispatcher, tuple[types.Type, ...]], ...] = (
     (predict, predict_signature.args),
     (start, start_signature.args),
     (update, update_signature.args),

@@ -84,7 +84,7 @@ def sensor_alarms(judged: JudgedRows) -> Iterator[FoundEpisode]:
             for run in runs((alarms & detector.bits != 0).any(axis=1), JOINED)
         ]
         lost = [item for bit in (STUCK, REFUSED) for item in runs((masks & bit != 0).any(axis=1), JOINED)]
-        for run in runs(masks.any(axis=1), JOINED):
+        for run in runs(np.any(masks, axis=1), JOINED):
             before = judged.alarmed[s] if judged.alarmed is not None and run.begin <= JOINED else 0
             own = sorted(item for item in lost if run.begin <= item.begin < run.end)
             later = [item for item in own if before + item.begin - run.begin > JOINED]

@@ -8,7 +8,7 @@ most likely end depends are kept.
 
 from __future__ import annotations
 
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 
@@ -225,7 +225,7 @@ class EpisodeTracker:
         self._room = max(2, min(self._max_rows, MAX_BYTES // max(1, row)))
         self._columns = [column[:0] for column in (*events, *track)]
 
-    def _put(self, new: list[Any], count: int) -> None:
+    def _put(self, new: list[np.ndarray], count: int) -> None:
         end = self.n + count
         for k, column in enumerate(new):
             kept = self._columns[k]

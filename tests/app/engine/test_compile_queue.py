@@ -22,10 +22,10 @@ from app.record.writer import Recorder
 from estimators.fold import Fold
 from estimators.numerics.cache import cache_folder
 from estimators.numerics.jit import threaded
-from estimators.pieces import LOOP, Piece, is_made, pieces_of
+from estimators.pieces import LOOP, Piece
 from estimators.registry import ESTIMATORS
 from estimators.tuning import Tuning
-from sources.pieces import FRAMES
+from sources.pieces import FRAMES, is_made, pieces_of
 from tests.app.engine.test_engine import reference as cold
 from tests.app.engine.test_engine import series
 from tests.app.record.test_parts import refold
@@ -349,7 +349,7 @@ def test_the_pieces_are_what_a_fold_compiles():
 
 
 MADE = """
-from estimators.pieces import LOOP, is_made, make, pieces_of
+from sources.pieces import is_made, make, pieces_of
 before = [is_made(piece) for piece in pieces_of("kf")]
 make(pieces_of("kf")[3])
 print(before, [is_made(piece) for piece in pieces_of("kf")])
