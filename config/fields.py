@@ -337,10 +337,16 @@ def _bounds(variance: object, std: object) -> tuple[float, float] | None:
     return (std.ends[0] ** 2, min(std.ends[1] ** 2, LARGEST)) if isinstance(std, BoundedSection) else None
 
 
+def _ordered(pair: Pair) -> Pair:
+    if None not in pair and pair[0] > pair[1]:  # type: ignore[operator]
+        raise refused("value", "the first must not be above the second")
+    return pair
+
+
 class ConditionSection(Section):
     """A range of values, its ends included, or texts of which a column must hold one."""
 
-    range: Pair = (None, None)
+    range: Annotated[Pair, AfterValidator(_ordered)] = (None, None)
     """Lowest and highest value, null for none. Default: any."""
     text: Texts | None = None
     """Text, or a list of texts. Default: null, the column holds numbers."""

@@ -13,7 +13,7 @@ from pydantic import ValidationError
 from estimators.errors import ConfigError, nearest
 
 from .model_schema import kind_of
-from .old_names import joined, read_yaml, tell_older
+from .old_names import read_yaml, tell_older
 from .problems import report, shown
 from .schema import ParameterSection, TwinSection, as_gate
 from .tunings import Version, find_version, keep_options, overlay
@@ -59,6 +59,8 @@ def find(name: str | os.PathLike[str]) -> Path:
     """
     text = os.fspath(name)
     path = Path(text).expanduser()
+    if not path.name:
+        raise ConfigError(f"{text}: it is a folder; give the YAML file in it")
     if path.suffix not in (".yaml", ".yml") and os.sep not in text:
         if text in shipped():
             return TWINS / f"{text}.yaml"
@@ -120,7 +122,6 @@ def load_text(
     # First what is named as a whole, then what is in it: a filter, then its options.
     for key, value in sorted((overrides or {}).items(), key=lambda item: item[0].count(".")):
         _override(data, places, key, value)
-    joined(data, places)
     try:
         config = TwinSection.model_validate(data)
     except ValidationError as error:

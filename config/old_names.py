@@ -19,9 +19,10 @@ import yaml
 from estimators.errors import ConfigError
 
 from .extensions import warn
-from .yaml_files import MERGE, Key, ValuePlaces, composed, dotted, end_of, parse, writing
+from .yaml_files import MERGE, Key, ValuePlaces, composed, dotted, end_of, parse, shown_path, writing
 
 ANY = None
+BY_HAND = "rewrite it by hand, as parts of it are shared or stand in two places"
 _tell = cache(warn)
 
 CHANNELS = [("source", group, ANY) for group in ("sensors", "inputs", "truth")]
@@ -77,11 +78,20 @@ def new_key(key: Key) -> Key:
 
 def new_overrides(overrides: Mapping[str, str], *, tell: bool = False) -> dict[str, str]:
     """Return the values of `--set` by the names and notations of this version; older ones are told with `tell`."""
-    ways = {key: new_key(tuple(key.split("."))) for key in overrides}
-    for key, way in ways.items():
+    found: dict[str, str] = {}
+    for key, text in overrides.items():
+        way = new_key(tuple(key.split(".")))
+        if way[0] == "estimate":
+            if len(way) != 3:
+                raise ConfigError(f"--set {key}={text}: give its entries, as in --set parameters.NAME.std=0.1")
+            way = ("parameters", *way[1:])
+            found.setdefault(dotted((*way[:2], "role")), "estimated")
         if tell and key != dotted(way):
             _tell(f"--set {key}: it is {dotted(way)} now")
-    return {dotted(ways[key]): rewritten(text, ways[key]) for key, text in overrides.items()}
+        if dotted(way) in found:
+            raise ConfigError(f"--set {key}={text}: {dotted(way)} is given twice; remove one")
+        found[dotted(way)] = rewritten(text, way)
+    return found
 
 
 def read_yaml(text: str, file: str) -> tuple[str, Any, ValuePlaces]:
@@ -96,46 +106,70 @@ def read_yaml(text: str, file: str) -> tuple[str, Any, ValuePlaces]:
     if len(named) > len(older):
         older.append("an interval is [low, high] now")
     if ("estimate",) in lines:
-        hand = ", move its entries there by hand" if ("parameters",) in lines else ""
-        older.append(f"estimate is `role: estimated` of an entry of parameters now{hand}")
+        older.append("estimate is `role: estimated` of an entry of parameters now")
+    for key, line in lines.items():
+        if (new := new_key(key)) != key and new in lines:
+            raise ConfigError(
+                f"{file}:{line}: {dotted(key)} is {new[-1]} now, which stands in line {lines[new]}; keep one"
+            )
     if older:
-        text = rewritten(text)
-        data, places = parse(text, file)
-        places.older = older
+        text, data = rewritten(text), _joined(renamed(data), places)
+        places.lines |= {new_key(key): line for key, line in lines.items()}
+        left = parse(text, file)[1].lines
+        places.older, places.by_hand = older, ("estimate",) in left or any(map(_is_old, left))
     return text, data, places
+
+
+def renamed(value: Any, key: Key = ()) -> Any:
+    """Return the data at `key` by the names and notations of this version."""
+    if isinstance(value, list):
+        return [renamed(item, (*key, k)) for k, item in enumerate(value)]
+    if not isinstance(value, dict):
+        return value
+    ways = {name: _way(key, name, isinstance(item, dict)) for name, item in value.items()}
+    return _interval(value, key) or {str(ways[name][-1]): renamed(item, ways[name]) for name, item in value.items()}
 
 
 def rewritten(text: str, key: Key = ()) -> str:
     """Return the text of the value at `key`, or of a file, by the names and notations of this version.
 
-    Text that is no YAML stays as it is.
+    Text stays as it is if it is no YAML, or if the data would be others: an alias or `<<` may share what is renamed.
     """
     with suppress(ConfigError):
-        parse(text, "")
-        return _edited(text, dict(_edits(composed(text), key, text)))
+        data, places = parse(text, "")
+        new = _edited(text, dict(_edits(composed(text), key, text)))
+        if _joined(parse(new, "")[0], places) == _joined(renamed(data, key), places):
+            return new
     return text
 
 
-def joined(data: dict[str, Any], places: ValuePlaces) -> None:
-    """Move the entries of `estimate`, a section of the version before, to those of `parameters`."""
-    given = data.get("estimate")
-    if not isinstance(given, dict) or not isinstance(data.get("parameters") or {}, dict):
-        return
-    del data["estimate"]
-    parameters = data["parameters"] = dict(data.get("parameters") or {})
-    for name, entry in given.items():
+def _joined(data: Any, places: ValuePlaces) -> Any:
+    """Return the data with the entries of `estimate`, a section of the version before, in those of `parameters`."""
+    if not isinstance(data, dict) or "estimate" not in data:
+        return data
+    parameters = data.get("parameters") or {}
+    if not isinstance(data["estimate"] or {}, dict) or not isinstance(parameters, dict):
+        return data
+    for name, entry in (data["estimate"] or {}).items():
         own = parameters.get(name)
         own = own if isinstance(own, dict) else {} if own is None else {"value": own}
-        parameters[name] = {**own, **entry, "role": "estimated"} if isinstance(entry, dict) else entry
-    known: Any
-    for known in (places.lines, places.options):
-        known |= {("parameters", *key[1:]): known[key] for key in known if key[:1] == ("estimate",)}
+        at = places.at(("estimate", name))
+        if not isinstance(entry, dict):
+            raise ConfigError(
+                f"{at}: estimate.{name} must be a mapping; write parameters.{name} with `role: estimated`"
+            )
+        if twice := [word for word in own if word in entry or word == "role"]:
+            raise ConfigError(f"{at}: estimate.{name} and parameters.{name} both give {twice[0]}; keep one")
+        parameters = {**parameters, name: {**own, **entry, "role": "estimated"}}
+    places.lines |= {("parameters", *key[1:]): line for key, line in places.lines.items() if key[:1] == ("estimate",)}
+    return {name: item for name, item in data.items() if name != "estimate"} | {"parameters": parameters}
 
 
 def tell_older(places: ValuePlaces) -> None:
     """Say which older names a file has."""
     if places.older:
-        _tell(f"{places.file}: {', '.join(places.older)}; `nisus migrate {places.file}` rewrites it")
+        way = BY_HAND if places.by_hand else f"`nisus migrate {places.file}` rewrites it"
+        _tell(f"{places.file}: {', '.join(places.older)}; {way}")
 
 
 def rewrite(path: Path, change: Callable[[str], str], out: Path | None = None) -> Path | None:
@@ -145,13 +179,16 @@ def rewrite(path: Path, change: Callable[[str], str], out: Path | None = None) -
         The copy of the file as it was, beside it; None where `out` was written.
 
     Raises:
-        ConfigError: If it cannot be written.
+        ConfigError: If it cannot be written, or has older names that cannot be rewritten.
     """
     with writing(out or path):
         with path.open(encoding="utf-8-sig", newline="") as file:
             text = file.read()
         end = "\r\n" if "\r\n" in text else "\n"
-        changed = change(rewritten(text.replace("\r\n", "\n"))).replace("\n", end)
+        new, _, places = read_yaml(text.replace("\r\n", "\n"), shown_path(path))
+        if places.by_hand:
+            raise ConfigError(f"{places.file}: {', '.join(places.older)}; {BY_HAND}")
+        changed = change(new).replace("\n", end)
         kept = None
         if out is None:
             numbers = (path.with_name(f"{path.name}.{k}.bak") for k in count(1))
@@ -188,15 +225,16 @@ def _edits(node: yaml.Node | None, key: Key, text: str) -> Iterator[tuple[int, t
     if not isinstance(node, yaml.MappingNode):
         return
     entries = {name.value: item for name, item in node.value}
-    interval = _interval(entries, key, text)
+    interval = _interval({name: text[item.start_mark.index : end_of(item)] for name, item in entries.items()}, key)
     if interval is not None:
         begin, end, between = node.start_mark.index, end_of(node), ""
+        anchor = "".join(re.findall(r"\A&\S+\s+", text[begin:end]))
         for name, item in node.value:
             between += text[begin : name.start_mark.index]
             begin = end_of(item)
         # Comments stay, and ends of lines, so that the lines below keep their numbers.
         left = re.findall(r"[ \t]*#.*|\n", between + text[begin:end])
-        yield node.start_mark.index, (end, interval + "".join(left))
+        yield node.start_mark.index, (end, anchor.replace("\n", " ") + _flow(interval) + "".join(left))
         return
     for name, item in node.value:
         if name.value == MERGE and not name.style:
@@ -205,25 +243,37 @@ def _edits(node: yaml.Node | None, key: Key, text: str) -> Iterator[tuple[int, t
             continue
         if (*key, name.value) == ("estimate",) and "parameters" not in entries and isinstance(item, yaml.MappingNode):
             yield name.start_mark.index, (name.end_mark.index, "parameters")
-            for _, own in item.value:
+            for own in (own for _, own in item.value if isinstance(own, yaml.MappingNode)):
                 end = end_of(own) - own.flow_style
                 yield (
                     end,
                     (end, ", role: estimated" if own.flow_style else f"\n{'':{own.start_mark.column}}role: estimated"),
                 )
             continue
-        new = new_key((*key, name.value))
-        if new[-1] != name.value and (new != ("correction",) or isinstance(item, yaml.ScalarNode)):
+        new = _way(key, name.value, isinstance(item, yaml.MappingNode))
+        if new[-1] != name.value:
             yield name.start_mark.index, (name.end_mark.index, str(new[-1]))
         yield from _edits(item, new, text)
 
 
-def _interval(entries: dict[str, yaml.Node], key: Key, text: str) -> str | None:
-    """Return a mapping that is an interval of before in the notation of now; None if it is none."""
-    given = {name: text[item.start_mark.index : end_of(item)] for name, item in entries.items()}
+def _way(key: Key, name: str, mapping: bool) -> Key:
+    """Return the new key of an entry; `learned` with a mapping is the head of a correction's own file."""
+    new = new_key((*key, name))
+    return (*key, name) if new == ("correction",) and mapping else new
+
+
+def _interval(given: dict[str, Any], key: Key) -> list[Any] | dict[str, Any] | None:
+    """Return a mapping of data or texts that is an interval of before in the notation of now; None if it is none."""
     if _like(key, INTERVALS) and {"min", "max"} & set(given) and set(given) <= {"min", "max", "extrapolate"}:
-        pair = f"[{given.get('min', 'null')}, {given.get('max', 'null')}]"
-        return f"{{range: {pair}, extrapolate: {given['extrapolate']}}}" if "extrapolate" in given else pair
+        pair = [given.get("min"), given.get("max")]
+        return {"range": pair, "extrapolate": given["extrapolate"]} if "extrapolate" in given else pair
     if _like(key, BOUNDED) and {"from", "to"} & set(given) and set(given) <= {"value", "from", "to"}:
-        return f"{{value: {given.get('value')}, range: [{given.get('from', 'null')}, {given.get('to', 'null')}]}}"
+        return {"value": given.get("value"), "range": [given.get("from"), given.get("to")]}
     return None
+
+
+def _flow(value: Any) -> str:
+    """Return an interval of texts as YAML."""
+    if isinstance(value, dict):
+        return f"{{{', '.join(f'{name}: {_flow(item)}' for name, item in value.items())}}}"
+    return f"[{', '.join(map(_flow, value))}]" if isinstance(value, list) else value or "null"

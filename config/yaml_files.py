@@ -86,6 +86,8 @@ class ValuePlaces:
     options: dict[Key, str] = field(default_factory=dict)
     older: list[str] = field(default_factory=list)
     """Names of the version before, in words; see `old_names`."""
+    by_hand: bool = False
+    """Whether its text cannot be rewritten by the names of this version."""
 
     def at(self, key: Key) -> str:
         """Return the place of `key`, or of the nearest section around it that the file has."""

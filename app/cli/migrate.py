@@ -23,9 +23,8 @@ def migrate(arguments: Arguments) -> int:
     for path in dict.fromkeys(file for twin in twins for file in (twin, *version_files(twin).values())):
         name = shown_path(path)
         try:
-            text = read_text(path, "nisus twins")
-            new, _, places = read_yaml(text, name)
-            kept = rewrite(path, lambda text: text) if new != text else None
+            _, _, places = read_yaml(read_text(path, "nisus twins"), name)
+            kept = rewrite(path, lambda text: text) if places.older else None
         except ConfigError as error:
             complain(error)
             status = 2

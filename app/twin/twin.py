@@ -256,8 +256,7 @@ def with_held(twin: Twin) -> Twin:
 
 def _of_yaml(overrides: Mapping[str, str]) -> dict[str, str]:
     """Return the overrides that change the YAML; the others are keys of the tuning."""
-    known = {*TwinSection.model_fields, "estimate"}  # which is a section of the version before, see `old_names.joined`
-    return {key: value for key, value in overrides.items() if key.split(".")[0] in known}
+    return {key: value for key, value in overrides.items() if key.split(".")[0] in TwinSection.model_fields}
 
 
 def _assemble(loaded: Loaded, overrides: Mapping[str, str], log_files: Sequence[str | os.PathLike[str]] | None) -> Twin:

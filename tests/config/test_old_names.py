@@ -6,7 +6,8 @@ import pytest
 
 from config import old_names
 from config.loader import load
-from config.old_names import new_key, rewrite, rewritten
+from config.old_names import new_key, new_overrides, read_yaml, rewrite, rewritten
+from config.yaml_files import parse
 from estimators.errors import ConfigError
 from tests.cases import cases
 from tests.support import error_of
@@ -116,13 +117,38 @@ def test_what_was_estimated_is_the_role_of_a_parameter(tmp_path):
     alone = loaded(tmp_path, JOINT).config.parameters
     assert alone == loaded(tmp_path, new).config.parameters and alone["r0"].role == alone["r1"].role == "estimated"
     # Beside a section of parameters the text stays; the values are the same.
-    both = loaded(tmp_path, JOINT + "parameters: {r1: {value: 0.03, std: 0.5}, r0: 0.02}\n")
-    assert both.text.startswith(JOINT) and both.places.older[-1].endswith("now, move its entries there by hand")
+    both = loaded(tmp_path, JOINT + "parameters: {r1: {value: 0.03}, r0: 0.02}\n")
+    assert both.text.startswith(JOINT) and both.places.by_hand
     given = {name: item.model_dump(exclude_unset=True) for name, item in both.config.parameters.items()}
     assert given["r0"] == {"value": 0.02, "std": 0.005, "drift": 1e-6, "role": "estimated"}
     assert given["r1"] == {"value": 0.03, "std": 0.01, "role": "estimated"}
     wrong = error_of(ConfigError, loaded, tmp_path, JOINT.replace("0.01", "-1"))
     assert wrong == f"{tmp_path / 'cell.yaml'}:5: parameters.r1.std is -1; it must be positive"
+    given = loaded(tmp_path, JOINT, **new_overrides({"estimate.r2.std": "0.1"})).config.parameters
+    assert (given["r2"].std, given["r2"].role, given["r0"].role) == (0.1, "estimated", "estimated")
+
+
+@cases(__file__, "shared_parts.csv")
+def test_data_are_renamed_where_the_text_cannot_be(tmp_path, old, new, rewrites):
+    """Aliases and `<<` may share what is renamed with what is not: the data count, and migrate leaves such a file."""
+    text, data, places = read_yaml(old, "cell.yaml")
+    assert {name: item for name, item in data.items() if not name.startswith("x-")} == parse(new, "")[0]
+    assert places.by_hand == (not rewrites) and text == (rewrites or old)
+    if places.by_hand:
+        (tmp_path / "cell.yaml").write_text(old)
+        assert error_of(ConfigError, rewrite, tmp_path / "cell.yaml", str).endswith(old_names.BY_HAND)
+        assert [path.name for path in tmp_path.iterdir()] == ["cell.yaml"]
+
+
+@cases(__file__, "two_names.csv")
+def test_what_is_given_by_two_names_is_refused(text, error):
+    assert error_of(ConfigError, read_yaml, text, "cell.yaml") == error
+
+
+def test_a_value_of_the_command_line_by_two_names_is_refused():
+    given = {"time.horizon": "2", "time.max_delay": "3"}
+    assert "time.max_delay is given twice" in error_of(ConfigError, new_overrides, given)
+    assert "--set parameters.NAME.std=0.1" in error_of(ConfigError, new_overrides, {"estimate.r1": "0.01"})
 
 
 @cases(__file__, "old_keys.csv")

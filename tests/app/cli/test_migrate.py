@@ -30,7 +30,8 @@ def test_migrate_rewrites_a_twin_and_its_versions_and_keeps_the_files(tmp_path, 
     assert (
         found.status == 2
         and found.err.count("\n") == 2
-        and "nisus: bad.yaml:1: time.max_delay is given twice" in found.err
+        and "nisus: bad.yaml:1: time.horizon is max_delay now, which stands in line 1; keep one" in found.err
     )
     assert nisus.refuses("migrate").endswith("no file is named; give at least one")
+    assert nisus.refuses("migrate", ".").endswith(".: it is a folder; give the YAML file in it")
     assert found.out.startswith("late.yaml: horizon (line 2) is max_delay now; the file as it was is late.yaml.1.bak")
