@@ -16,7 +16,6 @@ import numpy as np
 from can.io.blf import LOG_CONTAINER, LOG_CONTAINER_STRUCT, NO_COMPRESSION, OBJ_HEADER_BASE_STRUCT
 
 from ..units import to_ns
-from .readers import Raw
 
 KEY_BITS, REMOTE_FLAG = 0x9FFFFFFF, 0x80  # The highest bit of an id is that of an extended frame, as in `EXTENDED`.
 CAN_MESSAGE, CAN_MESSAGE2, RESTORE_POINT = 1, 86, 115
@@ -41,7 +40,7 @@ class BlfBlocks(can.BLFReader):
     bad: tuple[tuple[str, object], ...] = ()
     """Places of the blocks that could not be read, and why."""
 
-    def __iter__(self) -> Iterator[can.Message | Raw]:
+    def __iter__(self) -> Iterator[can.Message | tuple]:
         begin = self.file.tell()
         while data := self.file.read(HEAD.size):
             place, error = self.file.tell() - len(data), None
@@ -81,7 +80,7 @@ class BlfBlocks(can.BLFReader):
             self.file.seek(1 - HEAD.size, os.SEEK_CUR)
         return False
 
-    def _parse_container(self, data: bytes) -> Iterator[can.Message | Raw]:
+    def _parse_container(self, data: bytes) -> Iterator[can.Message | tuple]:
         # After a block that could not be read, an object of it may end here.
         joined = self._tail + data if self._tail else data[max(0, data.find(MARK)) :]
         found = frames_of(joined, self.start_timestamp)
@@ -94,10 +93,10 @@ class BlfBlocks(can.BLFReader):
         yield block
 
 
-def frames_of(data: bytes, start: float) -> tuple[Raw, int] | None:
+def frames_of(data: bytes, start: float) -> tuple[tuple, int] | None:
     """Return the CAN messages of a block and where its last whole object ends; None if python-can must read it.
 
-    They have numbers of buses in place of positions; the bytes (n, 8) are zero beyond
+    They are columns as in `readers.Raw`, with numbers of buses in place of positions; the bytes (n, 8) are zero beyond
     the length, and the total counts the remote frames too.
 
     Args:
@@ -142,7 +141,7 @@ def frames_of(data: bytes, start: float) -> tuple[Raw, int] | None:
     # As python-can rounds: first the product with 1e-5 or 1e-9, exact before it is rounded, then the sum.
     seconds = frames["time"] / np.where(frames["flags"] == 1, 1e5, 1e9) + start
     length = np.minimum(frames["dlc"], 8).astype(np.int64)
-    block = Raw(
+    block = (
         to_ns(seconds),
         (frames["id"] & KEY_BITS).astype(np.int64),
         frames["channel"].astype(np.int64) - 1,

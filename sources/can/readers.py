@@ -77,8 +77,8 @@ def read_messages(path: Path, wanted: frozenset[int] | None, longest: int) -> It
             try:
                 # One by one, so that frames before the fault are kept.
                 for message in islice(messages, size):
-                    if isinstance(message, Raw):
-                        block = message
+                    if isinstance(message, tuple):
+                        block = Raw(*message)
                         break
                     chunk.append(message)
             except SourceError:
