@@ -10,7 +10,7 @@ from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
 from datetime import UTC, datetime
 from queue import Empty, SimpleQueue
-from typing import Any, TextIO, cast
+from typing import TextIO, cast
 
 from estimators.errors import printable
 
@@ -41,7 +41,7 @@ class EndRequest:
         return True
 
 
-def when_asked_to_end(end: Callable[[], object]) -> Mapping[int, Any]:
+def when_asked_to_end(end: Callable[[], object]) -> Mapping[int, Callable | int | None]:
     """Call `end`, which must take no lock, when one of them comes; gives what handled them before.
 
     One that is ignored stays so: who started the program with `nohup` wants it to outlive the terminal.

@@ -179,7 +179,7 @@ def leave_out_undescribed() -> None:
                 del schemas(kind)[key]
 
 
-def maker(kind: Kind, key: str, asked: str = "", extra: str = "") -> Callable[..., Any]:
+def maker(kind: Kind, key: str, asked: str = "", extra: str = "") -> Callable:
     """Return the function of a part; `asked` is what needs it, and `extra` what brings it.
 
     In one of `GUARDED`, an error that is none of Nisus or of the system becomes a ConfigError.
@@ -192,7 +192,7 @@ def maker(kind: Kind, key: str, asked: str = "", extra: str = "") -> Callable[..
         raise ConfigError(f"{asked}: {rule}{left_out()}")
     name, part = registered(kind)[key]
     try:
-        make: Callable[..., Any] = pkgutil.resolve_name(part.make)
+        make: Callable = pkgutil.resolve_name(part.make)
     except Exception as error:  # noqa: BLE001  the module may be of a third party
         raise ConfigError(f"extension {name}: {_gist(error)}; install its package again") from None
 

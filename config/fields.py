@@ -105,7 +105,7 @@ Host = Annotated[str, Field(pattern=r"^[^\s/]+$")]
 Port = Annotated[int, Field(strict=True, ge=1, le=65535)]
 
 
-def as_list(value: Any) -> Any:
+def as_list(value: object) -> Any:
     """Return a lone value as a list of one."""
     return value if isinstance(value, (list, tuple)) or value is None else [value]
 

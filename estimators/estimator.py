@@ -23,7 +23,7 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from functools import lru_cache
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, TypeAlias
 
 import numpy as np
 from numba import types
@@ -46,6 +46,7 @@ call_update = caller(update_signature)
 call_describe = caller(describe_signature)
 
 
+Entry: TypeAlias = Any  # Address of a compiled function, or a function in Python
 Options = dict[str, float]
 """Values of an estimator's options by name."""
 
@@ -79,10 +80,10 @@ class Option(NamedTuple):
 class Code(NamedTuple):
     """Addresses of a filter's four functions."""
 
-    start: Any
-    predict: Any
-    update: Any
-    describe: Any
+    start: Entry
+    predict: Entry
+    update: Entry
+    describe: Entry
 
 
 code_type = types.NamedUniTuple(i64, len(Code._fields), Code)

@@ -9,7 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Collection, Mapping
 from dataclasses import dataclass
-from typing import Any, Literal
+from typing import Any, Literal, TypeAlias
 
 import numpy as np
 
@@ -18,6 +18,8 @@ from .numerics.linalg import wrapped
 
 BISECTIONS = 60
 """Halvings of the interval of the weight: to the last bit."""
+
+Message: TypeAlias = Mapping[str, Any]  # State message of /api/state, as a dictionary
 
 
 def covariance_intersection(
@@ -117,8 +119,8 @@ class Fused:
 
 
 def fuse(
-    first: Mapping[str, Any],
-    second: Mapping[str, Any],
+    first: Message,
+    second: Message,
     *,
     same: Mapping[str, str] | None = None,
     within: float = 0.0,
@@ -183,7 +185,7 @@ def fuse(
 class _Message:
     """A state message, read by the names of its states."""
 
-    def __init__(self, message: Mapping[str, Any], which: str) -> None:
+    def __init__(self, message: Message, which: str) -> None:
         version = message.get("version") if isinstance(message, Mapping) else None
         if version != "nisus.state/1":
             raise EstimatorError(

@@ -192,7 +192,7 @@ class Tuning:
                     )
             changed = getattr(self, group).copy()
             changed[index] = number
-        entry: dict[str, Any] = {group: changed}
+        entry = {group: changed}
         return self._changed(**entry)
 
     def rows_of(self, key: str) -> np.ndarray:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import os
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
-from typing import Any, BinaryIO, Literal
+from typing import BinaryIO, Literal
 
 from estimators.errors import SourceError
 
@@ -20,7 +20,7 @@ COMPRESSIONS = (".gz", ".bz2", ".lz4", ".zst")
 """Endings of compressed files, after that of the format. Of CAN logs, python-can reads `.gz` only."""
 
 
-def added(kind: Literal["tables", "folders"]) -> Mapping[str, Callable[[], Any]]:
+def added(kind: Literal["tables", "folders"]) -> Mapping[str, Callable]:
     """Return what extensions add, each as a function that loads it; the application sets it, a reader process has none.
 
     added("tables"): a `tables.rows.TableFormat`, by the ending of the name. added("folders"): for folders that are one

@@ -17,7 +17,7 @@ from estimators.errors import is_blank, nearest, quoted, shown_name
 from estimators.log import Events
 
 from .mapping import ABSENT, PRESENT, ChannelMapping
-from .source import AssetEvents, Channel, Report, ignore
+from .source import AssetEvents, Channel, Numbers, Report, ignore
 from .tables.text import TextMatch, column_of, no_value
 from .tables.times import ns_of_iso
 
@@ -277,7 +277,7 @@ class Messages:
                 self._stored.add(*self._unstored.popleft()[1:])
         return self._stored.state()
 
-    def restore(self, numbers: Mapping[str, Any]) -> None:
+    def restore(self, numbers: Numbers) -> None:
         """Take over the `numbers` of the source before a restart, if any, and keep them from now on."""
         self._stores = True
         self._sent.restore(numbers)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Generator, Mapping, Sequence
 from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING, Any, NamedTuple, Protocol, cast, runtime_checkable
+from typing import TYPE_CHECKING, Any, NamedTuple, Protocol, TypeAlias, cast, runtime_checkable
 
 if TYPE_CHECKING:
     import numpy as np
@@ -14,6 +14,7 @@ if TYPE_CHECKING:
 Report = Callable[[str, str], None]
 """report(key, text): counted under `key`, `text` shown among the events; called from the source's thread."""
 
+Numbers: TypeAlias = Mapping[str, Any]  # What a live source has read, as JSON keeps it over a restart
 LOST_FRAMES = "frames lost"  # Key of frames that a bus's socket lost before they were read
 NEVER = "never seen"  # Key of messages, signals and columns that channels need and the source never provides
 WRONG_TIME = "wrong time"  # Key of events that are rejected for their time
@@ -82,10 +83,10 @@ class Marked(Source, Protocol):
     mark: int
     """Number of items that were read."""
 
-    def numbers(self, mark: int) -> Mapping[str, Any]:
+    def numbers(self, mark: int) -> Numbers:
         """Return the state after `mark`, for `restore`; in one thread, with rising marks."""
 
-    def restore(self, numbers: Mapping[str, Any]) -> None:
+    def restore(self, numbers: Numbers) -> None:
         """Continue with the `numbers` of the source before a restart, if any, and keep them from now on."""
 
 

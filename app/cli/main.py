@@ -18,7 +18,7 @@ import warnings
 from collections.abc import Sequence
 from pathlib import Path
 from types import ModuleType
-from typing import Annotated, Any
+from typing import Annotated
 
 import tyro
 
@@ -97,7 +97,7 @@ def parse(arguments: Sequence[str]) -> object:
         kind = "option" if name.startswith("-") else "command"
         names = ["--help", "--version", COMPLETION] if name.startswith("-") else list(commands)
         raise ConfigError(f"{shown_name(name)}: there is no such {kind}; {nearest(name, names)}{left_out()}")
-    named: list[Any] = [
+    named: list[object] = [
         Annotated[command, tyro.conf.subcommand(name, description=described(command).split("\n")[0])]
         for name, command in commands.items()
     ]

@@ -217,4 +217,4 @@ Command = (
     | Note | Annotate | DeleteAnnotation | Reset | Maintenance | Pause | Speed | Step | Seek | Record | InjectFault
     | ClearFault | MuteAlerts
 )  # fmt: skip
-"""Any command."""
+"""A command."""

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import replace
-from typing import Any
+from typing import Any, TypeAlias
 
 import numpy as np
 
@@ -31,10 +31,11 @@ FOLDING_CAUSE = "the measurements so far are being folded"
 """Cause of a twin without a row yet."""
 
 WINDOW_REACH = 2 * MAX_ROWS_PER_READING  # Rows per measurement of the window: also those after its last measurement
+Known: TypeAlias = Mapping[str, Any]  # Fields of a status that are known without the fold
 SINCE_ROWS = 4096  # Rows copied at once in search of the beginning of a health
 
 
-def busy_status(last: Status, fields: Mapping[str, Any], busy: float) -> Status:
+def busy_status(last: Status, fields: Known, busy: float) -> Status:
     """Return the last status of a fold that has been at work for `busy` seconds, with the present known fields."""
     if last.t is None and busy >= 1.0 and fields["awaited"] is None:
         fields = {**fields, "cause": f"{FOLDING_CAUSE} ({busy:.0f} s so far)"}
@@ -47,7 +48,7 @@ def status_of(
     rows: RowCounts,
     watchers: Watchers,
     source: Source,
-    fields: Mapping[str, Any],
+    fields: Known,
     notices: Mapping[str, int],
     late: Mapping[str, int],
 ) -> Status:
@@ -182,7 +183,7 @@ def _nis_of_window(tuning: Tuning, policy: HealthPolicy, events: Events, track: 
     return nis_verdict(track.select(judged), events.select(judged), tuning.model, tuning.baseline)
 
 
-def _cause_without_rows(fold: Fold, watchers: Watchers, fields: Mapping[str, Any]) -> str:
+def _cause_without_rows(fold: Fold, watchers: Watchers, fields: Known) -> str:
     awaited = fields["awaited"]
     if fold.idle and awaited is not None:
         begun = fields["compiling"].get(awaited)

@@ -18,7 +18,6 @@ from contextlib import contextmanager, suppress
 from dataclasses import asdict, replace
 from functools import partial
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 
@@ -411,7 +410,7 @@ def _stored_twin(
     )  # fmt: skip
 
 
-def _check_integers(items: list[Any]) -> None:
+def _check_integers(items: list) -> None:
     """Raise ValueError or TypeError unless nested lists hold integers only."""
     for item in items:
         if isinstance(item, list):

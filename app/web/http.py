@@ -325,7 +325,7 @@ _adapter = cache(TypeAdapter)
 def _parameters(work: Callable[..., object]) -> type:
     """Return a dataclass of the parameters of a function, without `request` and `body`."""
     hints = typing.get_type_hints(work, include_extras=True)
-    fields: list[Any] = []
+    fields: list[tuple] = []
     for name, item in inspect.signature(work).parameters.items():
         if name not in ("request", "body"):
             default = () if item.default is item.empty else (dataclasses.field(default=item.default),)

@@ -74,7 +74,7 @@ class OpenedTwin:
     again: Callable[[], Twin] | None = None
     compile_queue: CompileQueue | None = None
     store: Path | None = None
-    archive: Callable[..., Any] | None = None
+    archive: Callable | None = None
 
 
 class RunningTwin:

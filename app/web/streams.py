@@ -297,7 +297,7 @@ async def feed_rerun(browser: WebSocket, feed: RerunFeed, status: Callable[[], J
     drawn.set()
 
     async def listen() -> None:
-        # Any short text means that the last frame is drawn; the page sends nothing longer.
+        # A short text means that the last frame is drawn; the page sends nothing longer.
         while (word := (await browser.receive()).get("text")) is not None and len(word) <= MAX_BODY_BYTES:
             drawn.set()
 

@@ -26,6 +26,7 @@ from numba.core.errors import NumbaError
 from numba.core.registry import CPUDispatcher, cpu_target
 from numba.core.typing import Signature as TypeSignature
 from numba.core.untyped_passes import TranslateByteCode
+from numpy.typing import ArrayLike
 
 from ..model.check import uncompilable
 from ..model.state_space import StateSpaceModel
@@ -283,7 +284,7 @@ def _lifted(functions: list[Any]) -> tuple[CPUDispatcher, list[tuple[object, ...
     return dispatcher, list(zip(*lifted, strict=True))
 
 
-def _same(a: Any, b: Any) -> bool:
+def _same(a: ArrayLike, b: ArrayLike) -> bool:
     if isinstance(a, np.ndarray):
         return np.array_equal(a, b, equal_nan=True)
     return bool(a == b)

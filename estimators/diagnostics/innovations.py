@@ -148,7 +148,7 @@ def sensor_noise(track: Track, events: Events, tuning: Tuning) -> dict[str, Sens
     """Return the noise of the sensor rows with enough measurements, estimated from their innovations ν.
 
     R̂ = mean ν² - (S - R), the variance of the innovations minus that of the prediction, H P⁻ Hᵀ. Measurements have the
-    weight 1 / S², the inverse of the variance of ν², so those predicted from a wide prior count little. Any excess of
+    weight 1 / S², the inverse of the variance of ν², so those predicted from a wide prior count little. All excess of
     the innovations is attributed to R, so the estimate is valid only if they are white: with a Q that is too small, or
     a slow error of model or sensor, it is too large. P⁻ depends on R; iterated, the estimate converges.
 

@@ -127,7 +127,7 @@ def truth_of(events: Events, state: int) -> tuple[np.ndarray, np.ndarray]:
     """Return the true values of one state.
 
     Args:
-        events: Any events.
+        events: Events of any kind.
         state: Index of the state.
 
     Returns:

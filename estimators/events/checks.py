@@ -96,7 +96,7 @@ def admitted(batch: Events, width: int, layout: EventLayout | None) -> Events:
     """Return the batch, with infinite values replaced by NaN, if a log accepts it.
 
     Args:
-        batch: Any events.
+        batch: Events of any kind.
         width: Value columns of the log; further ones hold variances.
         layout: Layout of the model, if the log has one.
 

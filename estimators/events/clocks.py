@@ -102,7 +102,7 @@ class ClockGuard:
         """Arrivals of the held events as they came, ns, shape (held,)."""
         return self._held.arrival - self.set_back
 
-    def state(self) -> dict[str, Any]:
+    def state(self) -> dict[str, object]:
         """Return a copy of the state, of arrays, lists and numbers, for `restore`."""
         return {
             "clocks": self._state.copy(),

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 
@@ -23,7 +23,7 @@ class FleetTable(NamedTuple):
     last measurements and its 95 % bounds. events, stale (N,): events folded, and dropped as too late.
     """
 
-    assets: Sequence[Any]
+    assets: Sequence[object]
     seconds: np.ndarray
     since: np.ndarray
     mean: np.ndarray

@@ -44,7 +44,7 @@ __all__ = ["fold", "fold_many"]
 
 NO_COVARIANCES = "the covariances were not kept; fold with covariance=True"
 
-Prior = tuple[Any, Any]
+Prior = tuple[np.ndarray, np.ndarray]
 Values = Mapping[str, ArrayLike]
 
 

@@ -51,7 +51,7 @@ def table_of(
     import pyarrow as pa
 
     sensors = np.array([*model.sensor_names, None], object)
-    columns: dict[str, Any] = {
+    columns: dict[str, object] = {
         "t_ns": events.t,
         "arrival_ns": events.arrival,
         "seconds": events.t * 1e-9,

@@ -14,12 +14,14 @@ import numpy as np
 from ..compiled.context import steps_of
 from ..compiled.verdict import limit_of
 from ..errors import ModelError
+from ..estimator import Code
 from ..gate.rejection_runs import Rule, forget, note
 from ..gate.soften import inflation
 from ..log import INPUT, MARK, READING, RESET, TICK, TRUTH
 from ..plausibility import pass_on, screen_reading
 from ..snapshots import Snapshot
 from ..track import ANCESTORS, EFFECTIVE, FAILED, GATED, LOG_LIKELIHOOD, MISSING, NONE, SCREENED, USED, WHITENED, Track
+from .view import View
 
 UNSET = int(np.iinfo(np.int64).min)
 """Clock before the first event. The first event sets it, as the prior holds at that time."""
@@ -28,14 +30,14 @@ MAX_PREDICT_STEPS = 10_000
 """Largest number of prediction steps between two events, so that a jump of the clock does not stall the fold."""
 
 
-def begin(code: Any, context: Any, mean: np.ndarray, cov: np.ndarray, state: np.ndarray) -> None:
+def begin(code: Code, context: View, mean: np.ndarray, cov: np.ndarray, state: np.ndarray) -> None:
     """Set the state to N(mean, cov)."""
     with np.errstate(all="ignore"):
         code.start(context, mean, cov, state)
 
 
 def _advance_to(
-    code: Any, context: Any, u: np.ndarray, clock: np.ndarray, t: int, index: int, state: np.ndarray, work: np.ndarray
+    code: Code, context: View, u: np.ndarray, clock: np.ndarray, t: int, index: int, state: np.ndarray, work: np.ndarray
 ) -> None:
     """Predict to time t; if the model fails, state and clock stay at the last step that succeeded."""
     begun = int(clock[0])
@@ -52,8 +54,8 @@ def _advance_to(
 
 
 def run(
-    code: Any,
-    context: Any,
+    code: Code,
+    context: View,
     rule: Rule,
     first: int,
     start: int,
@@ -173,7 +175,7 @@ def _soften(
     return verdict
 
 
-def run_and_judge(judge: Any, context: Any, code: Any, place: int, *given: Any) -> int:
+def run_and_judge(judge: Any, context: View, code: Code, place: int, *given: Any) -> int:
     """Fold events, and fill NIS windows, alarms and health of their rows; see `fold_kernel.run_and_judge`.
 
     `judge` is the compiled function there, `context` a `View` in place of the context at the address. The last argument

@@ -7,7 +7,6 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
-from typing import Any
 
 import numpy as np
 
@@ -59,7 +58,7 @@ class View:
         self.angles = [angles[part] for part in rows]
         self.R = [covariance_of(sensor.correlation, r) for sensor, r in zip(model.sensors, self.r, strict=True)]
         self._scratch = np.empty(scratch_size(model.nx, model.width))
-        self.kept: dict[Any, Any] = {}
+        self.kept: dict = {}
         self.failures = 0
         self.failure: ModelError | None = None
 

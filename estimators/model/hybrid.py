@@ -14,7 +14,6 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from functools import lru_cache
-from typing import Any
 
 import numpy as np
 
@@ -118,7 +117,7 @@ def gathered(X: np.ndarray, u: np.ndarray, place: np.ndarray) -> np.ndarray:
 
 @lru_cache(maxsize=64)
 def _added(
-    function: Callable, addition: Any, learned: LearnedCorrection, place: tuple[int, ...], target: tuple[int, ...]
+    function: Callable, addition: Callable, learned: LearnedCorrection, place: tuple[int, ...], target: tuple[int, ...]
 ) -> Callable:
     """Return f or F with the correction added to its result."""
     inner, add = as_inner(function), as_inner(addition)

@@ -10,7 +10,6 @@ from __future__ import annotations
 from collections.abc import Callable
 from dataclasses import replace
 from functools import lru_cache
-from typing import Any
 
 import numpy as np
 
@@ -109,7 +108,7 @@ def _moments(c, part):
 
 
 # Each wrapper has a function around the chances: a compiled function that takes another as an argument is not cached.
-def _next_mode(chances: Callable, j: int, count: int) -> Any:
+def _next_mode(chances: Callable, j: int, count: int) -> Callable:
     """Return a function that sets the mode in z, which it works in, to the mean of the next; return its variance."""
     jumping = as_inner(chances)
 

@@ -15,7 +15,7 @@ from uuid import UUID
 
 from numba.core.serialize import dumps
 
-from .jit import inner, plain
+from .jit import Inner, inner, plain
 
 LIBRARIES = ("numpy", "scipy", "numba", "math", "cmath")
 """Packages whose functions Numba supports itself, or not at all."""
@@ -30,7 +30,7 @@ def with_helpers(function: Callable) -> Callable:
     return _with_helpers(function, {})
 
 
-def _with_helpers(function: Any, known: dict[Any, Any]) -> Any:
+def _with_helpers(function: Callable, known: dict[Callable, Callable]) -> Callable:
     if not isinstance(function, FunctionType):
         return function
     used = {name: function.__globals__[name] for name in _names(function.__code__) if name in function.__globals__}
@@ -52,7 +52,7 @@ def _with_helpers(function: Any, known: dict[Any, Any]) -> Any:
     return made
 
 
-def compiled(helper: Any, known: dict[Any, Any], forceinline: bool = False) -> Any:
+def compiled(helper: Callable, known: dict[Callable, Any], forceinline: bool = False) -> Inner:
     """Return a function compiled for compiled callers, under an identifier by which the cache finds them again.
 
     Numba distinguishes closures by their content, a compiled function by an identifier that is random by default: one

@@ -16,7 +16,7 @@ Digital Library of Mathematical Functions, 22.2 and 20.2).
 
 from __future__ import annotations
 
-from typing import Any
+from collections.abc import Callable
 
 import numpy as np
 from scipy.special import ellipk, ellipkm1
@@ -112,7 +112,7 @@ def _shift(v, n, d, by, factor):
         d[i] = v.builder.fadd(d[i], added)
 
 
-def _resolving(group: int) -> Any:
+def _resolving(group: int) -> Callable:
     @vector_code()
     def resolve(v, n, d, e, b, count, shifts, weights, scratch, out):
         """out[:n] = Σ_k weights[k] (T + shifts[k] I)⁻¹ b, T tridiagonal with diagonal d[:n], and e[1:n] beside it.

@@ -91,7 +91,7 @@ class TwoForms(CPUDispatcher):  # type: ignore[misc]
         return self.linked._numba_type_
 
 
-def linkable(function: Callable, forceinline: bool = False) -> Any:
+def linkable(function: Callable, forceinline: bool = False) -> TwoForms:
     """`jit` for functions of filters that Python calls, too, or tests do: each form is compiled when first needed."""
     made = jit(function)
     made.__class__, made.forceinline = TwoForms, forceinline
@@ -125,13 +125,13 @@ def by_address(function: Callable) -> AddressOnly:
     return made
 
 
-part: Callable[[Callable], Any] = register_jitable(
+part: Callable[[Callable], Callable] = register_jitable(
     cache=True, nogil=True, error_model="numpy", forceinline=False, pipeline_class=Linked
 )
 """`jit` for functions that only compiled functions call, without the wrapper for Python, which takes a third of the
 compile time. Called from Python, the function runs as plain Python."""
 
-embedded: Callable[[Callable], Any] = register_jitable(
+embedded: Callable[[Callable], Callable] = register_jitable(
     cache=True, nogil=True, error_model="numpy", forceinline=True, pipeline_class=Linked
 )
 """`part` for a long helper in the steps of several filters: compiled once, and copied into each caller by LLVM.
@@ -175,7 +175,7 @@ def address(dispatcher: CPUDispatcher, signature: Signature) -> int:
     return int(_get_jit_address(dispatcher, signature))
 
 
-def caller(signature: Signature) -> Any:
+def caller(signature: Signature) -> Callable:
     """Return a function for compiled code, `call(address, *args)`, which calls the function at `address`."""
     args, result = signature.args, signature.return_type
 
@@ -195,7 +195,7 @@ def caller(signature: Signature) -> Any:
     return call
 
 
-def pointer(kind: types.Type) -> Any:
+def pointer(kind: types.Type) -> Callable:
     """Return a function for compiled code that reads an integer as an address, that of a pointer or a record."""
 
     @intrinsic
@@ -281,7 +281,7 @@ def stack_vector(like: Any, entries: Any) -> Any:
 
 
 @overload(stack_vector, inline="always", jit_options={"error_model": "numpy"})
-def _stack_vector(like: Any, entries: Any) -> Any:
+def _stack_vector(like: types.Type, entries: types.Type) -> Callable:
     def made(like: Any, entries: Any) -> Any:
         return carray(_on_stack(like, entries), (len(entries),))
 

@@ -10,7 +10,6 @@ import inspect
 import math
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
-from typing import Any
 
 from llvmlite import ir
 from llvmlite.ir import Value
@@ -34,7 +33,7 @@ def padded(n):
     return (n + LANES - 1) // LANES * LANES
 
 
-def vector_code(result: types.Type = types.void) -> Callable[[Callable], Any]:
+def vector_code(result: types.Type = types.void) -> Callable[[Callable], Callable]:
     """Decorator: make a function for compiled code out of one that writes its instructions.
 
     The decorated function gets `Lanes` and the arguments: of a contiguous float64 array an object with `data`, the
@@ -42,7 +41,7 @@ def vector_code(result: types.Type = types.void) -> Callable[[Callable], Any]:
     that are worked on. It returns the value of `result`, or None.
     """
 
-    def decorate(write: Callable) -> object:
+    def decorate(write: Callable) -> Callable:
         def typed(typing_context: object, *given: types.Type) -> tuple[Signature, Callable]:
             arguments = [
                 t if isinstance(t, types.Array) else types.float64 if isinstance(t, types.Float) else types.int64

@@ -16,8 +16,6 @@ Sources: Rauch, Tung & Striebel (1965), doi:10.2514/3.3166; Särkkä, Bayesian F
 
 from __future__ import annotations
 
-from typing import Any
-
 import numpy as np
 
 from ..compiled.context import circular_states
@@ -126,19 +124,19 @@ def turn(G, P, M, T):
             M[j, i] = s
 
 
-def changed(mean: np.ndarray, cov: np.ndarray, prior: np.ndarray, state: int) -> Any:
+def changed(mean: np.ndarray, cov: np.ndarray, prior: np.ndarray, state: int) -> tuple:
     """Return the note of a maintenance: one state of N(mean, cov) restarts with the prior's variance, uncorrelated."""
     C = cov.copy()
     C[:, state] = 0.0
     return _note(mean, cov, without(cov, prior, state), C)
 
 
-def widened(mean: np.ndarray, cov: np.ndarray, added: np.ndarray) -> Any:
+def widened(mean: np.ndarray, cov: np.ndarray, added: np.ndarray) -> tuple:
     """Return the note of a widened covariance: variances (nx,) are added to those of N(mean, cov)."""
     return _note(mean, cov, cov + np.diag(added), cov.copy())
 
 
-def _note(mean: np.ndarray, cov: np.ndarray, after: np.ndarray, C: np.ndarray) -> Any:
+def _note(mean: np.ndarray, cov: np.ndarray, after: np.ndarray, C: np.ndarray) -> tuple:
     """Return the note of a change that keeps the mean; C (nx, nx) is the covariance of the states before and after."""
     n = mean.size
     U, W = np.zeros((n, n)), np.zeros((n, n))

@@ -5,7 +5,6 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from math import ceil
-from typing import Any
 
 import numpy as np
 
@@ -138,7 +137,7 @@ class Effect:
         self._kind, self._target, self._given, self._rng = kind, target, given, rng
         self.lost = 0
         self.last: float | None = None
-        self._kept: dict[tuple[int, int], Any] = {}
+        self._kept: dict = {}
 
     def apply(self, item: FaultedEvent, moment: Moment) -> list[FaultedEvent]:
         """Return the events in place of one event."""

@@ -8,7 +8,7 @@ import threading
 import time
 import zlib
 from collections import deque
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
@@ -21,7 +21,7 @@ from estimators.log import Events
 
 from ..formats import is_compressed, suffix_of
 from ..mapping import ABSENT, PRESENT
-from ..source import NEVER, NO_ASSET, TRUNCATED, AssetEvents, Channel, Report, Source, ignore
+from ..source import NEVER, NO_ASSET, TRUNCATED, AssetEvents, Channel, Numbers, Report, Source, ignore
 from .rows import TableRows, dated, is_text, names_of, rows_of
 from .table import mapped
 from .text import HEAD_BYTES, UNREADABLE, Column, CsvFormat, TextCodes, chunk_of, column_of, format_of
@@ -143,7 +143,7 @@ class FollowedTable(Source):
                 self._stored[inode] = state
         return {str(inode): state for inode, state in self._stored.items()}
 
-    def restore(self, numbers: Mapping[str, Any]) -> None:
+    def restore(self, numbers: Numbers) -> None:
         """Continue at the `numbers` of the source before a restart, if any, and keep them from now on."""
         self._stores, self._stored = True, {int(inode): [*map(int, state)] for inode, state in numbers.items()}
         for inode, (offset, line, checked, head) in self._stored.items():

@@ -53,7 +53,7 @@ ARITHMETIC: dict[str, Callable[..., float]] = {
 }  # fmt: skip
 """Operations on numbers, and COMPARISONS; those by other names are functions of `math`."""
 
-SLOPES: dict[str, Callable[[Any, Any], Any]] = {
+SLOPES: dict[str, Callable[..., Term]] = {
     "sin": lambda value, a: a.cos(),
     "cos": lambda value, a: -a.sin(),
     "tan": lambda value, a: 1.0 + value * value,
@@ -95,7 +95,7 @@ class Term:
     def _with(self, operation: str, *of: object) -> Term:
         return self.reader.term(operation, *of)
 
-    def __array_ufunc__(self, ufunc: Any, method: str, *inputs: Any, **_: Any) -> Any:
+    def __array_ufunc__(self, ufunc: np.ufunc, method: str, *inputs: object, **_: object) -> object:
         """Apply one of NumPy's functions."""
         if method != "__call__":
             return NotImplemented

@@ -51,11 +51,11 @@ class ClusterExecutor(Executor):
         self._sent: dict[object, tuple[Callable[..., object], object]] = {}
         self._seconds: dict[object, float] = {}
 
-    def submit(self, fn: Callable[..., object], /, *given: Any, **named: Any) -> Future[Any]:
+    def submit(self, fn: Callable[..., object], /, *given: object, **named: object) -> Future:
         """Submit one call."""
         return self._cluster.submit(_call, packed(partial(fn, *given, **named), self._functions))
 
-    def map(self, fn: Callable[..., object], *iterables: Iterable[Any], **_: object) -> Iterator[Any]:
+    def map(self, fn: Callable[..., object], *iterables: Iterable, **_: object) -> Iterator:
         """Submit all calls, and return their results in order; calls that have not begun are cancelled at the end."""
         items = list(zip(*iterables, strict=False))
         # A partial of the same objects is the same function. Keeping it keeps their identities.
@@ -72,7 +72,7 @@ class ClusterExecutor(Executor):
         parts = [items[k : k + count] for k in range(0, len(items), count)]
         return [self._cluster.submit(_calls, self._sent[key][1], part) for part in parts]
 
-    def _results(self, key: object, futures: list[Future[Any]], rest: list[tuple[object, ...]]) -> Iterator[Any]:
+    def _results(self, key: object, futures: list[Future], rest: list[tuple[object, ...]]) -> Iterator:
         try:
             for future in futures:
                 self._seconds[key], found = future.result()

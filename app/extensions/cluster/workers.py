@@ -41,7 +41,7 @@ class Cluster:
         self._command = uuid.uuid4().hex, version("nisus"), os.getcwd()
         self._begin, self._closed, self.deserted = self.hold((begin, given)), threading.Event(), False
 
-    def submit(self, work: Callable[..., object], *call: object) -> Future[Any]:
+    def submit(self, work: Callable[..., object], *call: object) -> Future:
         """Submit a call; another worker makes it again if one dies. Its arguments may be held."""
         return self._executor.submit(_on_worker, self._command, self._begin, work, *call)
 

@@ -20,7 +20,7 @@ import weakref
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager, suppress
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import numpy as np
 
@@ -172,7 +172,7 @@ class Fmu:
 
         return h
 
-    def _rows(self, X: np.ndarray, u: np.ndarray, p: np.ndarray, columns: int, values: Callable[[], Any]) -> np.ndarray:
+    def _rows(self, X: np.ndarray, u: np.ndarray, p: np.ndarray, columns: int, values: Callable) -> np.ndarray:
         """Return what `values` gives at each state (N, columns); NaN where the FMU fails.
 
         Raises:

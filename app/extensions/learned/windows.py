@@ -116,7 +116,7 @@ def windows(
         mean = weight @ values[rows] / lasted
         found.append((mean, rate, t[edges[k]] * 1e-9, t[edges[k + 1]] * 1e-9, k * stretches // count, judging[0]))
     columns: list[Any] = list(zip(*found, strict=True)) or [()] * 6
-    rest: list[Any] = [np.array(c, kind) for c, kind in zip(columns[2:], "ddl?", strict=True)]
+    rest = [np.array(c, kind) for c, kind in zip(columns[2:], "ddl?", strict=True)]
     return Windows(np.reshape(columns[0], (-1, len(features))), np.reshape(columns[1], (-1, len(corrects))), *rest)
 
 

@@ -21,7 +21,7 @@ from app.twin.sources.kind import Opening, failure
 from app.twin.sources.push import messages_of
 from estimators.errors import printable, quoted, shown_name
 from sources.messages import LATEST, MAX_WAITING, NO_BROKER, REFUSED, REFUSED_MESSAGE, REFUSED_TOPIC, Messages
-from sources.source import Report, Source
+from sources.source import Numbers, Report, Source
 from sources.tables.text import no_value
 
 from .client import mqtt_client
@@ -296,7 +296,7 @@ class MqttSource:
         numbers = self.messages.numbers(mark)
         return {"senders": numbers, "packets": self._packets.state()} if self._by_hand else numbers
 
-    def restore(self, numbers: Mapping[str, Any]) -> None:
+    def restore(self, numbers: Numbers) -> None:
         """See `Marked`."""
         self.messages.restore(numbers.get("senders", {}) if self._by_hand else numbers)
         if self._by_hand:

@@ -1,8 +1,8 @@
 """Picture of a twin for the gallery: an SVG with the page's colours, drawn from a fold of the twin's own log.
 
 A field is a map, a vehicle its track among walls, a battery the charge of its cells, three states without a unit a
-curve in the plane, 32 states or more an image over time. Any other twin shows one state with its band: a parameter that
-is estimated, a discrete mode, or a state that no sensor measures.
+curve in the plane, 32 states or more an image over time. All others show one state with its band: a parameter that is
+estimated, a discrete mode, or a state that no sensor measures.
 """
 
 from __future__ import annotations

@@ -14,7 +14,7 @@ from __future__ import annotations
 import re
 from collections.abc import Callable
 from pathlib import Path
-from typing import IO, Any
+from typing import IO
 
 import numpy as np
 
@@ -66,7 +66,7 @@ def write_bag(file: IO[bytes], twin: Twin, fold: Fold, smoothed: Smoothed | None
     from rosbags.typesys import Stores, get_typestore
 
     store = get_typestore(Stores.LATEST)
-    make: Any = store.types
+    make = store.types
     model, track = twin.model, fold.track
     cov = covariances(model, track, fold.pairs)
     root = re.sub(r"\W", "_", twin.name)

@@ -40,7 +40,7 @@ class MessageField(NamedTuple):
     is missing if one of `invalid` holds of the message.
     """
 
-    get: Callable[[object], Any]
+    get: Callable
     invalid: tuple[Test, ...] = ()
     array: bool = False
     names: Callable[[object], Sequence[str]] | None = None
@@ -178,12 +178,12 @@ def _fields(types: Any, kind: str, prefix: str = "", invalid: tuple[Test, ...] =
     return found
 
 
-def _part(path: str, of: Callable[[Any, Any], float], key: str | int) -> Callable[[object], float]:
+def _part(path: str, of: Callable[..., float], key: str | int) -> Callable[[object], float]:
     get = attrgetter(path)
     return lambda message: of(get(message), key)
 
 
-def _test(path: str, rule: Callable[[Any], bool]) -> Test:
+def _test(path: str, rule: Callable[..., bool]) -> Test:
     get = attrgetter(path)
     return lambda message: rule(get(message))
 

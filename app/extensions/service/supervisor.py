@@ -194,7 +194,7 @@ class Supervisor:
     def _watch(self) -> None:
         while not self._thread.stopping.is_set():
             twins = list(self.twins.values())
-            pipes: dict[Any, ServedTwin] = {twin.pipe: twin for twin in twins if twin.pipe is not None}
+            pipes: dict[object, ServedTwin] = {twin.pipe: twin for twin in twins if twin.pipe is not None}
             waited: list[Any] = [*pipes, *(twin.process.sentinel for twin in twins if twin.process is not None)]
             for pipe in set(wait(waited, 0.2)) & set(pipes) if waited else self._rest():
                 self._listen(pipes[pipe])

@@ -79,7 +79,7 @@ class ReaderJob(Job):
         function: Callable[..., Iterator[object]],
         path: Path,
         *args: object,
-        then: Callable[[Any], None] = lambda item: None,
+        then: Callable[..., None] = lambda item: None,
     ) -> None:
         """Begin `function(path, *args)`, a generator function, importable by name.
 
