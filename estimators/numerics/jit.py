@@ -281,7 +281,7 @@ def stack_vector(like: Any, entries: Any) -> Any:
 
 
 @overload(stack_vector, inline="always", jit_options={"error_model": "numpy"})
-def _stack_vector(like: types.Type, entries: types.Type) -> Callable:
+def _stack_vector(like: Any, entries: Any) -> Callable:
     def made(like: Any, entries: Any) -> Any:
         return carray(_on_stack(like, entries), (len(entries),))
 
