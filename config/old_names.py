@@ -101,17 +101,17 @@ def read_yaml(text: str, file: str) -> tuple[str, Any, ValuePlaces]:
     """
     data, places = parse(text, file)
     lines = places.lines
-    named = {key[-1]: (line, new_key(key)[-1]) for key, line in lines.items() if _is_old(key)}
-    older = [f"{old} (line {line}) is {new} now" for old, (line, new) in named.items() if old != new]
+    old = [key for key in lines if _is_old(key)]
+    named = {key[-1]: (lines[key], new_key(key)[-1]) for key in old}
+    older = [f"{name} (line {line}) is {new} now" for name, (line, new) in named.items() if name != new]
     if len(named) > len(older):
         older.append("an interval is [low, high] now")
     if ("estimate",) in lines:
         older.append("estimate is `role: estimated` of an entry of parameters now")
-    for key, line in lines.items():
+    for key in old:
         if (new := new_key(key)) != key and new in lines:
-            raise ConfigError(
-                f"{file}:{line}: {dotted(key)} is {new[-1]} now, which stands in line {lines[new]}; keep one"
-            )
+            rule = f"is {new[-1]} now, which stands in line {lines[new]}; keep one"
+            raise ConfigError(f"{file}:{lines[key]}: {dotted(key)} {rule}")
     if older:
         text, data = rewritten(text), _joined(renamed(data), places)
         places.lines |= {new_key(key): line for key, line in lines.items()}
