@@ -24,10 +24,22 @@ OWN = ("arrival_ns", "tuning_version")
 """Of each process: when readings came, and how many tunings it has made."""
 
 
+def run():
+    return running(TWIN, **{"source.duration": str(SECONDS)})
+
+
 @pytest.fixture(scope="module")
 def session():
-    with running(TWIN, **{"source.duration": str(SECONDS)}) as session:
+    """For tests that change nothing: they run in any order."""
+    with run() as session:
         yield session
+
+
+@pytest.fixture
+def own():
+    """The engine of a test that changes its tuning or model, and its client."""
+    with run() as session:
+        yield session.engine, Client(session.running.server)
 
 
 @pytest.fixture(scope="module")
@@ -61,9 +73,8 @@ def same(one, other):
 
 
 def edited(engine, key, number):
-    if engine.status().revision < number:  # no test before has made it
-        engine.submit(SetTuning(key, 0.5))
-        wait_for(lambda: engine.status().revision == number)
+    engine.submit(SetTuning(key, 0.5))
+    wait_for(lambda: engine.status().revision == number)
 
 
 @pytest.mark.parametrize("piece", [8192, 64])
@@ -107,8 +118,8 @@ def test_what_cannot_be_is_one_line(client):
     assert client.raw("GET", "/api/track.parquet", foreign).status == 403
 
 
-def test_versions_of_the_model_and_runs_that_are_kept(client, session, monkeypatch):
-    engine = session.engine
+def test_versions_of_the_model_and_runs_that_are_kept(own, monkeypatch):
+    engine, client = own
     first = pull_all(engine)
     engine.submit(Maintenance("bearings", ("magnet", "winding")))
     wait_for(lambda: engine.status().model_version == 2)
@@ -134,21 +145,22 @@ def test_versions_of_the_model_and_runs_that_are_kept(client, session, monkeypat
     assert gone.status == 409 and "its track is gone" in gone.text
 
 
-def test_the_report_of_a_run_is_that_of_the_page(client, session):
-    edited(session.engine, "Q.winding", 1)
+def test_the_report_of_a_run_is_that_of_the_page(own):
+    engine, client = own
+    edited(engine, "Q.winding", 1)
     answer = client.get("/api/report.html?run=1")
     page = ParsedHtml(answer.text)
     text = " ".join(page.text)
     assert answer.status == 200 and 'filename="motor_joint-run1.html"' in answer.headers["content-disposition"]
     assert not page.tags & {"link", "img", "iframe"}
-    first = session.engine.twin.tuning.get("Q.winding")
+    first = engine.twin.tuning.get("Q.winding")
     assert "1: Q.winding" in text and f"Changed: Q.winding {first:.6g} → 0.5." in text
     assert "Runs of the session" in text and "as it began" in text
 
 
-def test_the_report_names_no_run_that_has_left_the_table(client, session):
+def test_the_report_names_no_run_that_has_left_the_table(own):
     """A run that is loaded goes on under another number."""
-    engine = session.engine
+    engine, client = own
     edited(engine, "Q.winding", 1)
     edited(engine, "Q.tooth", 2)
     engine.submit(Load(1))
