@@ -16,6 +16,9 @@ FIRST = 16
 FACTOR = 4
 """Groups of one level in a group of the next."""
 
+NEVER = 2**62
+"""A row after every row."""
+
 
 class Groups(NamedTuple):
     """Consecutive groups of `size` rows; the first has number `start`.
@@ -78,9 +81,8 @@ def _extremes(extreme: np.ufunc, size: int, first: int, values: np.ndarray) -> n
     """
     before, n = first % size, len(values)
     after = -(before + n) % size
-    found = np.asfortranarray(values).T
-    if before or after:
-        found = np.pad(found, ((0, 0), (before, after)), constant_values=np.nan)
+    found = np.full((values.shape[1], before + n + after), np.nan)
+    found[:, before : before + n] = values.T
     while size % 2 == 0:
         found, size = extreme(found[:, ::2], found[:, 1::2]), size // 2
     if size > 1:
@@ -89,11 +91,11 @@ def _extremes(extreme: np.ufunc, size: int, first: int, values: np.ndarray) -> n
 
 
 class Pyramid:
-    """The levels of some columns, kept up to date from the rows that changed."""
+    """The levels of some columns: the finest is kept up to date from the rows that changed, others when asked for."""
 
     def __init__(self, columns: int) -> None:
         self._columns = columns
-        self._levels = [_Level(FIRST, columns)]
+        self._levels = {FIRST: _Level(FIRST, columns)}
 
     def update(self, first: int, t: np.ndarray, values: np.ndarray) -> None:
         """Take rows that are new or rewritten; they replace all known ones from there on.
@@ -101,40 +103,36 @@ class Pyramid:
         `first` is the absolute index of the first one: a multiple of `FIRST`, or the oldest row that still exists.
         Times (n,) ascend; values are (n, columns).
         """
-        fresh = grouped(FIRST, first, t, values)
-        for k in range(len(self._levels) + 1):
-            if k == len(self._levels):
-                if self._levels[-1].groups.n < 2 * FACTOR:
-                    break
-                self._levels.append(_Level(FIRST * FACTOR**k, self._columns))
-                fresh = coarser(self._levels[k - 1].groups)
-            self._levels[k].replace_from(fresh)
-            if not fresh.n:
-                break
-            groups = self._levels[k].groups
-            fresh = coarser(groups.part(fresh.start // FACTOR * FACTOR, groups.start + groups.n))
+        self._levels[FIRST].replace_from(grouped(FIRST, first, t, values))
+        for level in self._levels.values():
+            level.changed = min(level.changed, first)
 
     def forget(self, oldest: int) -> None:
         """Drop the groups whose rows are all older than that index."""
-        for level in self._levels:
-            level.drop(oldest // level.groups.size)
+        for level in self._levels.values():
+            level.drop(oldest // level.size)
 
     def level(self, size: int) -> Groups:
-        """Return the groups of that size."""
-        for level in self._levels:
-            if level.groups.size == size:
-                return level.groups
-        groups = self._levels[-1].groups
-        while groups.size < size and groups.n:
-            groups = coarser(groups)
-        return groups
+        """Return the groups of that size: `FIRST` times a power of `FACTOR`."""
+        if size not in self._levels:
+            self._levels[size] = _Level(size, self._columns)
+        level = self._levels[size]
+        if size > FIRST:
+            finer = self.level(size // FACTOR)
+            finer = finer.part(level.changed // size * FACTOR, finer.start + finer.n)
+            if finer.n:
+                level.replace_from(coarser(finer))
+            level.changed = NEVER
+        return level.groups
 
 
 class _Level:
     """The groups of one size, in columns that grow by doubling."""
 
     def __init__(self, size: int, columns: int) -> None:
-        self._start, self._n, self._size = 0, 0, size
+        self._start, self._n, self.size = 0, 0, size
+        self.changed = 0
+        """First row that is new since these groups were made of finer ones."""
         self._room: list[np.ndarray] = [
             np.zeros(64, np.int64), np.zeros(64, np.int64), np.zeros((64, columns)), np.zeros((64, columns)),
             np.zeros((64, columns), bool),
@@ -144,7 +142,7 @@ class _Level:
     def groups(self) -> Groups:
         """Return views of the groups."""
         first, last, low, high, rising = (column[: self._n] for column in self._room)
-        return Groups(self._size, self._start, first, last, low, high, rising)
+        return Groups(self.size, self._start, first, last, low, high, rising)
 
     def replace_from(self, fresh: Groups) -> None:
         """Put groups in place of those from their number on."""
