@@ -78,10 +78,12 @@ class WorkerProcess:
         except OSError as error:
             raise EOFError from error
 
-    @property
-    def alive(self) -> bool:
-        """Whether the process is still there."""
-        return self._process.poll() is None
+    def waits(self) -> bool:
+        """Return whether it waits for work; one that was ended is still there while its memory is given back."""
+        self.submit(iter, ())
+        with suppress(EOFError):
+            return self.answer(EXIT_TIMEOUT_S) is not None
+        return False
 
     def processor_time(self) -> float | None:
         """Return the processor time, s, of a process that computes or waits for a processor; None if it sleeps."""
@@ -183,7 +185,7 @@ DRAIN_S = 0.1
 MAX_IDLE_WORKERS = 2
 """Idle readers that are kept; each has loaded its libraries, which takes longer than most files."""
 
-EXIT_TIMEOUT_S = 5.0  # Seconds between the end of a process's pipe and its own
+EXIT_TIMEOUT_S = 5.0  # Seconds between the end of a process's pipe and its own, and to answer while idle
 
 
 class ReaderError(SourceError):
@@ -211,7 +213,7 @@ def _hire() -> WorkerProcess:
     with _lock:
         while _idle:
             worker = _idle.pop()
-            if worker.alive:
+            if worker.waits():
                 break
             worker.end()
         else:

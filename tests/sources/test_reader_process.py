@@ -214,7 +214,6 @@ def test_a_reader_that_is_left_with_its_source_is_ended():
 def test_a_spare_reader_that_died_is_replaced():
     pid = read_isolated(pid_then, PATH, print)[0]
     os.kill(pid, signal.SIGKILL)
-    wait_until_gone(pid)
     assert read_isolated(counting, PATH, 2) == [0, 1]
 
 

@@ -32,8 +32,9 @@ def opened():
     served.stop()
 
 
-page = pytest.fixture(opened, scope="module")
-damaged_page = pytest.fixture(opened)
+page = pytest.fixture(opened)
+shared = pytest.fixture(opened, scope="module")
+"""For tests whose order does not matter: each sends what is newer than all before, or nothing that is taken."""
 
 
 def sent(page, body, kind=JSON):
@@ -79,19 +80,18 @@ def test_the_published_state_is_that_of_the_fold_whatever_the_form(page):
 
 
 @cases(__file__, "refused_messages.csv")
-def test_each_message_has_its_answer_and_a_wrong_one_does_not_hold_up_the_others(page, wrong, reason):
-    before = page.rows()
+def test_each_message_has_its_answer_and_a_wrong_one_does_not_hold_up_the_others(shared, wrong, reason):
+    before = shared.rows()
     wrong = json.loads(wrong.replace("BEYOND", f"1{400 * '0'}"))
-    status, found = sent(page, [wrong, message(before + 10, 41.0), wrong, message(before + 11, 41.0)])
+    status, found = sent(shared, [wrong, message(before + 10, 41.0), wrong, message(before + 11, 41.0)])
     assert (status, found["accepted"], found["refused"]) == (200, 2, 2)
     for item in found["items"][::2]:
         assert item["status"] == "refused" and reason in item["reason"] and "\n" not in item["reason"]
     assert found["items"][1::2] == [accepted(1, "used"), accepted(3, "used")]
-    wait_for(lambda: page.rows() == before + 2)
+    wait_for(lambda: shared.rows() == before + 2)
 
 
 def test_a_message_that_was_sent_before_is_taken_once(page):
-    before = page.rows()
     batch = [message(100 + k, 42.0, source="plc", sequence=k) for k in range(5)]
     assert sent(page, batch)[1]["accepted"] == 5
     again = sent(page, [*batch[::-1], message(105, 42.0, source="plc", sequence=5)])[1]
@@ -99,13 +99,12 @@ def test_a_message_that_was_sent_before_is_taken_once(page):
     assert [item["status"] for item in again["items"]] == ["duplicate"] * 5 + ["accepted"]
     other = sent(page, message(106, 42.0, source="gateway", sequence=5))[1]
     assert other["accepted"] == 1
-    wait_for(lambda: page.rows() == before + 7)
+    wait_for(lambda: page.rows() == 7)
 
 
 def test_null_is_a_dropout(page):
-    before = page.get("/api/state")["sensors"][0]["dropouts"]
     assert sent(page, message(107, None))[1]["items"] == [accepted(0, "unused")]
-    wait_for(lambda: page.get("/api/state")["sensors"][0]["dropouts"] == before + 1)
+    wait_for(lambda: page.get("/api/state")["sensors"][0]["dropouts"] == 1)
 
 
 def test_an_answer_says_what_became_of_a_message(page):
@@ -117,16 +116,16 @@ def test_an_answer_says_what_became_of_a_message(page):
     assert [item["became"] for item in items] == ["used", "late", "stale", "waiting"]
 
 
-def test_measurements_that_are_old_when_they_arrive_have_their_age(damaged_page):
+def test_measurements_that_are_old_when_they_arrive_have_their_age(page):
     begin = time.time_ns() - 3600 * SECOND
-    sent(damaged_page, [{"time": begin + k * SECOND, "values": {"winding": 40.0}} for k in range(40)])
-    found = wait_for(lambda: (state := damaged_page.get("/api/state"))["time_ns"] == begin + 39 * SECOND and state)
+    sent(page, [{"time": begin + k * SECOND, "values": {"winding": 40.0}} for k in range(40)])
+    found = wait_for(lambda: (state := page.get("/api/state"))["time_ns"] == begin + 39 * SECOND and state)
     assert 3561 <= found["age_s"] < 4000 and found["health"] == "degraded" and found["estimate_valid"]
     assert found["cause"].endswith("s old when they arrive")
-    status = wait_for(lambda: (last := damaged_page.engine.status()).t == begin + 39 * SECOND and last)
+    status = wait_for(lambda: (last := page.engine.status()).t == begin + 39 * SECOND and last)
     assert status.sensors == {"winding": ("degraded", status.cause)} and status.since <= begin
-    sent(damaged_page, {"values": {"winding": 40.0}})
-    found = wait_for(lambda: (state := damaged_page.get("/api/state"))["time_ns"] > begin + 3600 * SECOND and state)
+    sent(page, {"values": {"winding": 40.0}})
+    found = wait_for(lambda: (state := page.get("/api/state"))["time_ns"] > begin + 3600 * SECOND and state)
     assert found["age_s"] < 400 and "old when" not in found["cause"]
 
 
@@ -140,8 +139,8 @@ def test_measurements_that_are_old_when_they_arrive_have_their_age(damaged_page)
         (b" " * (8 * 2**20 + 1), JSON, 413, "a body may have 8 MB and 100,000 messages; send fewer"),
     ],
 )
-def test_a_body_that_cannot_be_read_is_refused_in_one_line(page, body, kind, status, text):
-    found, answer = sent(page, body, kind)
+def test_a_body_that_cannot_be_read_is_refused_in_one_line(shared, body, kind, status, text):
+    found, answer = sent(shared, body, kind)
     assert found == status and text in str(answer) and str(answer).strip().count("\n") == 0
 
 
@@ -154,8 +153,7 @@ def arrow(columns, compression=None):
     return sink.getvalue().to_pybytes()
 
 
-def test_a_small_body_is_no_large_work_and_reads_no_memory_of_others(damaged_page):
-    page = damaged_page  # Its messages have any time.
+def test_a_small_body_is_no_large_work_and_reads_no_memory_of_others(page):
     bounds = "Nisus: a body may have 8 MB and 100,000 messages; send fewer messages at once.\n"
     for body, kind in ((b"[" + b"1," * 100_000 + b"1]", JSON), (b"1\n" * 100_001, LINES)):
         assert sent(page, body, kind) == (413, bounds)
@@ -191,8 +189,8 @@ def test_a_line_that_is_no_json_is_refused_alone(page):
     assert [item["status"] for item in sent(page, body, LINES)[1]["items"]] == ["refused", "accepted"]
 
 
-def test_names_and_units_are_told(page):
-    assert page.get("/api/readings") == {"values": [{"name": "winding", "unit": "°C"}]}
+def test_names_and_units_are_told(shared):
+    assert shared.get("/api/readings") == {"values": [{"name": "winding", "unit": "°C"}]}
 
 
 def test_a_twin_with_another_source_says_so(serve):

@@ -77,7 +77,7 @@ def test_a_row_that_holds_for_long_becomes_degraded_and_then_stale():
     t = np.array([0, 100 * 10**9])
     events = Events(t, t, np.full(2, READING, np.int8), np.zeros(2, np.int32), np.zeros((2, 2)))
     track = Track.allocate(2, 1, 0, 2)
-    track.health[:] = ADVISORY
+    track.health[:], track.age[:] = ADVISORY, 0.0
     shares = health_of(events, track, HealthPolicy(degraded_after=5.0, stale_after=30.0))
     assert (shares["advisory"], shares["degraded"], shares["stale"]) == (0.05, 0.25, 0.7)
 

@@ -11,7 +11,9 @@ from tests.cases import cases
 from tests.support import SECOND
 from tests.waiting import wait_for
 
-page = pytest.fixture(opened, scope="module")
+page = pytest.fixture(opened)
+shared = pytest.fixture(opened, scope="module")
+"""For tests of which nothing is taken."""
 
 
 def pushed(page, nisus, monkeypatch, text, *options):
@@ -46,10 +48,10 @@ def test_lines_of_ndjson_are_sent_and_the_wrong_ones_named(page, nisus, monkeypa
 
 
 @cases(__file__, "refused_pushes.csv")
-def test_push_says_what_is_wrong_with_address_and_columns(page, nisus, monkeypatch, url, lines, text):
+def test_push_says_what_is_wrong_with_address_and_columns(shared, nisus, monkeypatch, url, lines, text):
     monkeypatch.delenv("NISUS_URL", raising=False)
     monkeypatch.setattr("sys.stdin", io.StringIO(lines))
-    given = [] if not url else [url.format(host=page.client.origin, url=page.server.url)]
+    given = [] if not url else [url.format(host=shared.client.origin, url=shared.server.url)]
     assert text in nisus.refuses("push", *given, *(["--time", "tme"] if "tme" in text else []))
 
 

@@ -20,10 +20,15 @@ ESTIMATE = "#0b62c4"
 """In the light theme; the page of this test is dark."""
 
 
-@pytest.fixture(scope="module", params=["motor_winding", "motor_joint"])
-def session(request):
+def started(request):
     with running(request.param) as session:
         yield session
+
+
+TWINS = ["motor_winding", "motor_joint"]
+session = pytest.fixture(started, scope="module", params=TWINS)
+own_session = pytest.fixture(started, params=TWINS)
+"""Of a test that changes it."""
 
 
 def opened(visit, address, beside=None):
@@ -208,8 +213,8 @@ def test_a_plot_of_diagnose_as_a_drawing_of_its_own(page, session, tmp_path):
     assert picture.read_bytes().startswith(b"\x89PNG")
 
 
-def test_of_a_run_whose_track_is_gone_nothing_is_offered_and_it_says_why(page, session):
-    engine = session.engine
+def test_of_a_run_whose_track_is_gone_nothing_is_offered_and_it_says_why(visit, own_session):
+    page, engine = opened(visit, own_session.url), own_session.engine
     first = engine.revisions.runs[-1].number
     key = f"Q.{engine.model.noises[0].name}"
     # More than the two seconds apart within which edits of one entry are one.
