@@ -89,7 +89,6 @@ class ChartedRun:
         self.source, self._columns, self._minus = source, columns, minus
         self._cursor = source.cursor()
         self._running = -1
-        self._tick: int | None = None
         self.levelled: list[str] = []
         """Columns with levels of detail."""
         self._pyramid = Pyramid(0)
@@ -100,21 +99,18 @@ class ChartedRun:
         """Give the cursor back."""
         self.source.release(self._cursor)
 
-    def sync(self, columns: Iterable[str], tick: int | None = None) -> None:
-        """Take new rows, and bring the levels of these columns up to date; for each tick once.
+    def sync(self, columns: Iterable[str]) -> None:
+        """Take new rows, and bring the levels of these columns up to date.
 
         Columns that need no levels any more cost nothing from the next revision on.
         """
-        columns, known = set(columns), tick is not None and tick == self._tick
-        self._tick = tick
-        self.changed = self.end
+        columns = set(columns)
         running = -1 if self._minus is None else self._minus.revisions.runs[-1].number
         if not columns.issubset(self.levelled) or running != self._running:
             self._running = running
             self.close()
             self._cursor = self.source.cursor()
-        elif known:
-            return
+        self.changed = self.end
         for rows in follow(self.source, self._cursor, align=FIRST):
             pull = self._taken(rows)
             if pull.fresh:

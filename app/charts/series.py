@@ -56,8 +56,8 @@ class Series:
             self.streams.discard(stream)
             self._prune()
 
-    def frames(self, streams: Iterable[ChartStream], tick: int | None = None) -> list[bytes]:
-        """Return frames with the changes of these streams since the last call; new rows are taken once a tick."""
+    def frames(self, streams: Iterable[ChartStream]) -> list[bytes]:
+        """Return frames with the changes of these streams since the last call."""
         with self._lock:
             origin, newest = self.origin(), self._engine.span()[1]
             if origin is None or not newest:
@@ -72,7 +72,7 @@ class Series:
             for name, run in runs.items():
                 if run is not None:
                     viewers = [stream for stream in self.streams if stream.query.run == name]
-                    run.sync({column for stream in viewers for column in stream.levelled}, tick)
+                    run.sync({column for stream in viewers for column in stream.levelled})
                     for stream in viewers:
                         stream.mark_changed(run.changed)
             return [frame for stream, run in shown if (frame := stream.frame(run, origin)) is not None]

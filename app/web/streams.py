@@ -221,12 +221,11 @@ class PageStream:
     async def _draw(self) -> None:
         """Send chart points, once the page has drawn the last ones."""
         while True:
+            begun = time.monotonic()
             if self._drawn.is_set():
-                # All pages draw at the same times, so that new rows are taken once for all of them.
-                tick = None if self._asked.is_set() else round(time.monotonic() / FRAME_PERIOD_S)
                 self._asked.clear()
                 streams = list(self._streams.values())
-                frames = await in_thread(self._series.frames, streams, tick) if streams else []
+                frames = await in_thread(self._series.frames, streams) if streams else []
                 if frames:
                     self._drawn.clear()
                     for frame in frames:
@@ -235,7 +234,7 @@ class PageStream:
                     await self._browser.send_text('{"frames":true}')
             await self._send_estimate()
             with contextlib.suppress(TimeoutError):
-                async with asyncio.timeout(FRAME_PERIOD_S - time.monotonic() % FRAME_PERIOD_S):
+                async with asyncio.timeout(max(0.001, FRAME_PERIOD_S - (time.monotonic() - begun))):
                     # A new query and a new revision are answered at once, if the page has drawn the last frames.
                     await self._drawn.wait()
                     await self._asked.wait()

@@ -37,9 +37,9 @@ class Viewer:
         self.stream = ChartStream("charts", ChartQuery(columns, **query), series.columns)
         series.open(self.stream)
 
-    def look(self, tick=None):
+    def look(self):
         """Take the next frames; return how many there were."""
-        frames = self.series.frames([self.stream], tick)
+        frames = self.series.frames([self.stream])
         for frame in frames:
             self.take(frame)
         return len(frames)
@@ -161,24 +161,6 @@ def test_rows_that_arrive_while_a_frame_is_made_are_in_the_next_one(monkeypatch,
     viewer.look()
     assert viewer.look() == 0
     same(viewer, shown(stepped.engine, MEAN, points=points, **query))
-
-
-def test_rows_are_taken_once_a_tick_for_all_browsers():
-    stepped = stepped_with(1_000)
-    series = Series(stepped.engine)
-    one, other = Viewer(series, MEAN, points=40), Viewer(series, MEAN, points=40)
-    for viewer in (one, other):
-        viewer.look(tick=1)
-        stepped.put(measured(37, stepped.engine.end()))
-    assert series.runs["live"].end == 1_000
-    same(one, other, exact=True)
-    for viewer in (one, other):
-        assert viewer.look(tick=2) == 1 and viewer.look(tick=2) == 0
-        same(viewer, shown(stepped.engine, MEAN, points=40))
-    # Who asks, and whom the levels lack, does not wait.
-    stepped.put(measured(37, stepped.engine.end()))
-    assert other.look() == 1 and Viewer(series, UPPER, points=40).look(tick=3) == 1
-    same(other, shown(stepped.engine, MEAN, points=40))
 
 
 def test_points_are_no_more_than_asked_for():
