@@ -21,10 +21,11 @@ from .can.log import CanLog, check_log, frames_reader
 from .can.readers import EXTENDED, BusName, LogSummary, Raw
 from .formats import CAN_LOGS, check_once, check_present, suffix_of
 from .source import UNDATED, Channel
+from .tables.dates import CLOCK, is_day
 from .tables.order import Order, time_order
 from .tables.rows import TableRows, format_of, is_text, names_of, rows_of
 from .tables.text import NO_VALUE, QUALITY_WORD, UNREADABLE, TextMatch, csv_format, open_text
-from .tables.times import CLOCK, DAY, SKIPPED, TWICE, TimeColumn, TimeReader
+from .tables.times import EPOCH_S, SKIPPED, TWICE, TimeColumn, TimeReader
 from .units import heading_unit, suffix_unit
 
 MAX_FRAME_BYTES = 64  # Bytes of the longest frame, of CAN FD
@@ -34,7 +35,7 @@ MIN_GAP_INTERVALS = 20.0
 """Seconds, or median intervals if they are longer, from which on a pause is a gap."""
 
 TIME_NAMES = (
-    "t", "time", "timestamp", "seconds", "time_s", "t_s", "date", "datetime", "unix_time", "elapsed", "zeit",
+    "t", "ts", "time", "timestamp", "seconds", "time_s", "t_s", "date", "datetime", "unix_time", "elapsed", "zeit",
     "zeitstempel", "datum", "horodatage", "fecha",
 )  # fmt: skip
 """Usual names of a time column; otherwise the first one of dates is taken, or the first that is named like one."""
@@ -323,6 +324,7 @@ def _tables(files: list[Path], time: TimeColumn) -> RecordingContents:
         return _sparse(files, time, columns, order, faults)
     for path in files:
         for rows in _rows(path, time, columns, faults, counted):
+            time = time._replace(unit=rows.unit)
             times.append(rows.t[rows.known])
             values.append(rows.values[rows.known])
             order.check(path.name, rows.line[rows.known], times[-1])
@@ -455,7 +457,7 @@ def _cells(path: Path) -> Iterator[list[str]]:
 
 
 def _time_of(path: Path, names: Sequence[str], time: TimeColumn) -> str | None:
-    """Return the time column, by its name or as the first one of dates."""
+    """Return the time column, by its name, as the first one of dates, or as the first that counts from 1970."""
     last = {name.lower().rpartition(".")[2].partition("[")[0].strip(): name for name in reversed(names)}
     named = next((last[name] for name in TIME_NAMES if name in last), None)
     like = next((name for name in names if TIME_NAME.search(name)), None)
@@ -468,15 +470,29 @@ def _time_of(path: Path, names: Sequence[str], time: TimeColumn) -> str | None:
                 continue
             if pattern.fullmatch(cell) if pattern else TimeReader(time._replace(name=name)).is_date(cell):
                 return name
-    return like
+    if like is not None:
+        return like
+    rows = list(islice(_cells(path), MAX_TEXTS))
+    return next((name for k, name in enumerate(names) if _since_1970([cell[k] for cell in rows])), None)
+
+
+def _since_1970(cells: list[str]) -> bool:
+    """Return whether numbers rise and are times since 1970, in any unit."""
+    try:
+        numbers = np.array(cells, np.float64)
+    except ValueError:
+        return False
+    low, high = (end * np.array([1.0, 1e3, 1e6, 1e9]) for end in EPOCH_S)
+    rising = numbers.size > 1 and numbers[-1] > numbers[0] and bool(np.all(np.diff(numbers) >= 0.0))
+    return rising and bool(np.any((low <= numbers[0]) & (numbers[-1] <= high)))
 
 
 def _with_clock(path: Path, names: Sequence[str], time: TimeColumn) -> TimeColumn:
     """Return the time column; both, if it is one of a CSV with dates in one column and clocks in another."""
     rows = [[cell.strip() for cell in row] for row in islice(_cells(path), MAX_TEXTS)] if is_text(path) else []
     days, clocks = (
-        [k for k in range(len(names)) if rows and all(pattern.fullmatch(row[k]) for row in rows)]
-        for pattern in (DAY, CLOCK)
+        [k for k in range(len(names)) if rows and all(is_one(row[k]) for row in rows)]
+        for is_one in (is_day, CLOCK.fullmatch)
     )
     chosen = names.index(time.name)
     if time.clock is None and clocks and chosen in days:

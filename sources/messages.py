@@ -18,8 +18,8 @@ from estimators.log import Events
 
 from .mapping import ABSENT, PRESENT, ChannelMapping
 from .source import AssetEvents, Channel, Numbers, Report, ignore
+from .tables.dates import ns_of_iso
 from .tables.text import TextMatch, column_of, no_value
-from .tables.times import ns_of_iso
 
 ACCEPTED, DUPLICATE, REFUSED = "accepted", "duplicate", "refused"
 """Whether a message was taken."""

@@ -55,12 +55,17 @@ def show_log(arguments: Arguments) -> int:
     if arguments.json:
         print(to_json(_as_dict(found)))
         return 0
+    complain_of(found)
+    print(to_text([_topic(part) for part in found.parts or (found,)]))
+    return 0
+
+
+def complain_of(found: RecordingContents) -> None:
+    """Print what is wrong with a recording, and what was assumed to read it."""
     for text in found.faults[:MAX_LISTED]:
         complain(text)
     if len(found.faults) > MAX_LISTED:
         complain(f"and {len(found.faults) - MAX_LISTED} more faults")
-    print(to_text([_topic(part) for part in found.parts or (found,)]))
-    return 0
 
 
 def contents_of(files: tuple[Path, ...], options: TableOptions) -> RecordingContents:

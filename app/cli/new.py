@@ -111,11 +111,13 @@ def new_twin(arguments: Arguments) -> int:
     if arguments.log:
         from ..study.advice.draft import check_new, write_draft
         from ..study.advice.plan import plan
-        from .log import contents_of, databases_of
+        from .log import complain_of, contents_of, databases_of
 
         check_new(arguments.name, arguments.folder)
         found = contents_of(arguments.log, arguments)
-        drafted = fit_draft(plan(found, roles_of(arguments)))
+        planned = plan(found, roles_of(arguments))
+        complain_of(found)
+        drafted = fit_draft(planned)
         written = write_draft(drafted, found, arguments.name, arguments.folder, databases_of(arguments))
         report_draft(written, arguments.json)
         return 0

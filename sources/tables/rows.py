@@ -48,7 +48,7 @@ _FORMATS = {
 class TableRows(NamedTuple):
     """Rows of a table: line (or row) of each, time (ns) and whether it is known, values (n, columns), mask of blanks.
 
-    `problems` are those found on the way: key, line, text. `words`: see `Chunk`.
+    `problems` are those found on the way: key, line, text. `words`: see `Chunk`. `unit` is that of the times.
     """
 
     line: np.ndarray
@@ -58,6 +58,7 @@ class TableRows(NamedTuple):
     blank: np.ndarray
     problems: tuple[tuple[str, int, str], ...]
     words: tuple[str, ...] = ()
+    unit: str = "s"
 
 
 def format_of(path: Path) -> TableFormat | None:
@@ -157,7 +158,7 @@ def dated(chunk: Chunk, times: TimeReader, time: TimeColumn, problems: list[tupl
         problems.append((UNDATED, int(chunk.line[row]), _undated(time, chunk.time[row])))
     problems += [(key, int(chunk.line[row]), text) for row, key, text in times.notes]
     times.notes.clear()
-    return TableRows(chunk.line, t, known, chunk.values, chunk.blank, (), chunk.words)
+    return TableRows(chunk.line, t, known, chunk.values, chunk.blank, (), chunk.words, times.unit)
 
 
 def _undated(time: TimeColumn, cell: object) -> str:

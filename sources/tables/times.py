@@ -16,6 +16,7 @@ import numpy as np
 from estimators.errors import SourceError, quoted
 
 from ..units import to_ns
+from .dates import CLOCK, is_day, layout, ns_of_date, ns_of_iso, since_epoch
 
 if TYPE_CHECKING:
     import pyarrow
@@ -31,21 +32,11 @@ SERIAL_DAYS = {"excel": 25_569, "matlab": 719_529}
 MAX_TIME_NS = 2**62
 """Distance (146 years) of a time from 0; numbers beyond it are of another unit, or no times."""
 
-_EPOCH = datetime(1970, 1, 1, tzinfo=UTC)
-_NAIVE_EPOCH = datetime(1970, 1, 1)
+EPOCH_S = (631_152_000, 2_840_140_800)  # 1990 and 2060
+_COMPACT = re.compile(r"(?:19|20)\d{10}(?:\d\d(?:\d{3})?)?")  # 20240315080000, with or without seconds and milliseconds
 
-_MONTHS = {name: k for k, name in enumerate("jan feb mar apr may jun jul aug sep oct nov dec".split(), start=1)}
-
-_DATE = re.compile(
-    r"(\d{1,4})([./ -])(\d{1,2}|[A-Za-z]{3})\2(\d{2,4})"
-    r"(?:[T ,]+(\d{1,2}):(\d{2})(?::(\d{2})(?:[.,](\d{1,9}))?)?(?:\s*([AaPp])\.?[Mm]\.?)?)?"
-)
-"""25.10.2020 01:00:00, 10/25/2020 1:00 PM, 25-Oct-2020 01:00:00.250, 2020/10/25."""
-
-DAY = re.compile(r"(?:19|20)\d{6}|\d{1,4}([./ -])(?:\d{1,2}|[A-Za-z]{3})\1\d{2,4}")
-CLOCK = re.compile(r"(\d{1,2}):(\d{2})(?::(\d{2})(?:[.,](\d{1,9}))?)?(?:\s*([AaPp])\.?[Mm]\.?)?")
 _NAMED_DAY = re.compile(r"(?<!\d)((?:19|20)\d\d)([-_.]?)(0[1-9]|1[0-2])\2(0[1-9]|[12]\d|3[01])(?!\d)")
-"""A date without a clock, a clock without a date (13:05, 1:05:00.250 PM), and a date in the name of a file."""
+"""A date in the name of a file."""
 
 MAX_CLOCK_STEP_BACK_NS = 3600 * 10**9  # By which a clock without a date goes back within one day
 TWICE, SKIPPED, ASSUMED = "hour that occurs twice", "hour that never occurs", "time assumed"
@@ -87,8 +78,9 @@ class TimeReader:
     """Converts a time column to nanoseconds, chunk by chunk.
 
     A clock without a date begins at the column's `date`, or that in the name of the file `path`, and passes midnight
-    when it goes back by more than an hour. Without a file, it is no time. `notes` are rows of the last chunk whose time
-    was assumed: row, key, text.
+    when it goes back by more than an hour. Without a file, it is no time. Numbers that are too large for seconds are of
+    the unit in which the first one is a time between 1990 and 2060. `notes` are rows of the last chunk whose time was
+    assumed: row, key, text.
 
     Raises:
         SourceError: If dates may be day/month as well as month/day, or the zone is unknown.
@@ -97,6 +89,7 @@ class TimeReader:
     def __init__(self, column: TimeColumn, path: Path | None = None) -> None:
         self._column = column
         self.notes: list[tuple[int, str, str]] = []
+        self.unit = column.unit
         named = _NAMED_DAY.search(path.name) if path is not None else None
         date = column.date or ("-".join(named.group(1, 3, 4)) if named else None)
         alone = path is not None and column.clock is None
@@ -105,6 +98,7 @@ class TimeReader:
         self._day: str | None = ""  # the last cell; None once a date without a clock has been noted
         days = SERIAL_DAYS.get(column.unit)
         self._factor = UNITS[column.unit] if days is None else DAY_NS
+        self._seconds = column.unit == "s"  # until the first number shows that they are
         self._origin = days or 0
         self._order: str | None = None
         self._summer = _SummerTime(column, self.notes) if column.zone is not None else None
@@ -126,11 +120,14 @@ class TimeReader:
             whole = cells.cast(pyarrow.timestamp("ns", zone)).cast(pyarrow.int64())
             t = whole.fill_null(0).to_numpy(zero_copy_only=False)
             return self._local(t, known & (zone is None)), known
+        numeric = pyarrow.types.is_floating(kind) or pyarrow.types.is_integer(kind)
+        if self._seconds and numeric and known.any():
+            self._fit_unit(float(cells.drop_null()[0].as_py()))
         if pyarrow.types.is_integer(kind) and not self._origin:
             whole = cells.cast(pyarrow.int64()).fill_null(0).to_numpy(zero_copy_only=False)
             known = known & (np.abs(whole) <= MAX_TIME_NS // self._factor)
             return np.where(known, whole, 0) * self._factor, known
-        if pyarrow.types.is_floating(kind) or pyarrow.types.is_integer(kind):
+        if numeric:
             numbers = cells.cast(pyarrow.float64()).to_numpy(zero_copy_only=False) - self._origin
             known = known & (np.abs(numbers) <= MAX_TIME_NS / self._factor)
             t = to_ns(np.where(known, numbers, 0.0) * (self._factor / 1e9))
@@ -139,7 +136,7 @@ class TimeReader:
 
     def is_date(self, cell: str) -> bool:
         """Return whether a cell is a date, day or month first."""
-        return self._of_text(cell) is not None or _DATE.fullmatch(cell) is not None
+        return self._of_text(cell) is not None or layout(cell) is not None
 
     def _of_cells(self, cells: list[str]) -> tuple[np.ndarray, np.ndarray]:
         if self._order is None and self._column.format is None:
@@ -150,7 +147,7 @@ class TimeReader:
             found = self._of_text(cell)
             if found is not None and abs(found[0]) <= MAX_TIME_NS:
                 (t[k], naive[k]), known[k] = found, True
-            if cell == self._day and DAY.fullmatch(cell):
+            if cell == self._day and is_day(cell):
                 rule = "a date without a clock: they all have its midnight; name the clock's column too (time.column)"
                 self.notes.append((k, ASSUMED, f"{self._column.label} is {quoted(cell)} in several rows, {rule}"))
                 self._day = None
@@ -160,49 +157,38 @@ class TimeReader:
 
     def _of_text(self, text: str) -> tuple[int, bool] | None:
         """Return one cell as ns, and whether that is local time; a number is taken exactly as it is written."""
-        if "_" in text:
-            return None  # 1_000 is a number in Python only.
         if self._column.format is not None:
             try:
                 when = datetime.strptime(text, self._column.format)
             except ValueError:
                 return None
-            t, naive = _since_epoch(when)
+            t, naive = since_epoch(when)
             alone = self._midnight is not None and (when.year, when.month, when.day) == (1900, 1, 1)
             return self._of_clock(t % DAY_NS) if alone else (t, naive)
         try:
-            number = float(text)
+            number = float(text if "_" not in text else "")  # 1_000 is a number in Python only.
         except ValueError:
             if CLOCK.fullmatch(text) and self._midnight is not None:
-                clock = self._of_date(f"1970/01/01 {text}")
+                clock = ns_of_date(f"1970/01/01 {text}", False)
                 return clock and self._of_clock(clock[0])
-            return ns_of_iso(text) or self._of_date(text)
+            return ns_of_iso(text) or ns_of_date(text, self._order == "month")
         if not np.isfinite(number):
             return None
+        if self._seconds and _COMPACT.fullmatch(text):
+            return ns_of_date(f"{text[:8]} {text[8:12]}{text[12:14] or '00'}.{text[14:] or '0'}", False)
+        if self._seconds:
+            self._fit_unit(number)
         return int(((Decimal(text) - self._origin) * self._factor).to_integral_value()), self._origin > 0
 
-    def _of_date(self, text: str) -> tuple[int, bool] | None:
-        match = _DATE.fullmatch(text)
-        if match is None:
-            return None
-        first, _, second, third, hour, minute, second_of_minute, fraction, half = match.groups()
-        month_first = self._order == "month"
-        day, month, year = (second, first, third) if month_first else (first, second, third)
-        if len(first) == 4:
-            year, month, day = first, second, third
-        try:
-            when = datetime(
-                int(year) + (2000 if len(year) == 2 else 0),
-                _MONTHS[month.lower()] if month.isalpha() else int(month),
-                int(day),
-                int(hour or 0) % (12 if half else 24) + (12 if (half or "").lower() == "p" else 0),
-                int(minute or 0),
-                int(second_of_minute or 0),
-            )
-        except (ValueError, KeyError):
-            return None
-        t, naive = _since_epoch(when)
-        return t + int((fraction or "0").ljust(9, "0")), naive
+    def _fit_unit(self, number: float) -> None:
+        """Take the unit of the times from the first of them, if that is too large for seconds."""
+        self._seconds = False
+        for unit in ("ms", "us", "ns"):
+            t = number * UNITS[unit] / 1e9
+            if abs(number) * 1e9 > MAX_TIME_NS and EPOCH_S[0] <= t <= EPOCH_S[1]:
+                self.unit, self._factor, when = unit, UNITS[unit], datetime.fromtimestamp(t, UTC)
+                text = f"{self._column.label} is {number:.0f}, taken as {unit} since 1970 ({when:%Y-%m-%d %H:%M} UTC)"
+                self.notes.append((0, ASSUMED, f"{text}; set the time's unit (time.unit, --time-unit) to be sure"))
 
     def _of_clock(self, clock: int) -> tuple[int, bool]:
         """Return a clock (ns) on the day on which it follows the rows before it."""
@@ -299,25 +285,6 @@ class _SummerTime:
         return second if late else first
 
 
-def _since_epoch(when: datetime) -> tuple[int, bool]:
-    """Return ns, and whether `when` has no offset."""
-    naive = when.tzinfo is None
-    delta = when - (_NAIVE_EPOCH if naive else _EPOCH)
-    return (delta.days * 86_400 + delta.seconds) * 10**9 + delta.microseconds * 1000, naive
-
-
-def ns_of_iso(text: str) -> tuple[int, bool] | None:
-    """Return an ISO 8601 date as ns, and whether it has no offset."""
-    head, dot, tail = text.partition(".")
-    digits = len(tail) - len(tail.lstrip("0123456789"))
-    fraction, offset = tail[:digits], tail[digits:]
-    try:
-        t, naive = _since_epoch(datetime.fromisoformat(head + offset))
-    except ValueError:
-        return None
-    return t + (int(fraction[:9].ljust(9, "0")) if dot and fraction else 0), naive
-
-
 def _day_and_month(name: str, cells: Sequence[str]) -> str:
     """Return which comes first in dates such as 25.10.2020: "day" or "month".
 
@@ -326,18 +293,19 @@ def _day_and_month(name: str, cells: Sequence[str]) -> str:
     """
     unclear = None
     for cell in islice(cells, MAX_DETECTION_CELLS):
-        match = _DATE.fullmatch(cell)
-        if match is None or len(match[1]) == 4 or not match[3].isdigit() or ns_of_iso(cell):
+        found = layout(cell)
+        if found is None or not found.either:
             continue
-        if match[2] == "." or int(match[1]) > 12:
+        first, second = map(int, re.findall(r"\d+", cell)[:2])
+        if "." in cell[:3] or first > 12:
             return "day"
-        if int(match[3]) > 12:
+        if second > 12:
             return "month"
         unclear = unclear or cell
     if unclear is None:
         return "day"
-    separator = _DATE.fullmatch(unclear)[2]  # type: ignore[index]
-    day, month = (separator.join(order) for order in (("%d", "%m", "%Y"), ("%m", "%d", "%Y")))
+    separator, year = unclear.lstrip("0123456789")[0], "%y" if layout(unclear).digits == 2 else "%Y"  # type: ignore[union-attr]
+    day, month = (separator.join(order) for order in (("%d", "%m", year), ("%m", "%d", year)))
     clock = " %H:%M:%S" if unclear.count(":") == 2 else " %H:%M" if ":" in unclear else ""
     raise SourceError(
         f"{name} is {quoted(unclear)}, which may be day{separator}month or month{separator}day; set the time's format "

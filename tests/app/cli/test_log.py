@@ -188,3 +188,14 @@ def test_a_folder_is_called_one(tmp_path, nisus, command, name):
     (tmp_path / name).mkdir()
     said = nisus.refuses(command, str(tmp_path / name))
     assert f"{name}: it is a folder; name " in said
+
+
+def test_a_draft_tells_which_column_and_unit_of_time_it_assumes(tmp_path, nisus):
+    rng, start = np.random.default_rng(2), 1_710_489_600_000
+    rows = [f"{500 - k},{start + 1000 * k},{x:.3f}\n" for k, x in enumerate(np.cumsum(rng.normal(0, 1, 300)))]
+    (tmp_path / "a.csv").write_text("left,stamp_1,x\n" + "".join(rows))
+    said = nisus("new", "made", "--folder", tmp_path, "--log", str(tmp_path / "a.csv")).err
+    assert f"a.csv:2: stamp_1 is {start}, taken as ms since 1970 (2024-03-15 08:00 UTC); set the time's unit" in said
+    assert 'time: {column: "stamp_1", unit: ms}' in (tmp_path / "made.yaml").read_text()
+    folded = nisus("fold", str(tmp_path / "made.yaml"))
+    assert "taken as" not in folded.err

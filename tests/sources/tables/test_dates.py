@@ -1,0 +1,107 @@
+"""Spellings of a date: each is the moment that it names, or refused."""
+
+from __future__ import annotations
+
+import random
+from datetime import UTC, datetime, timedelta
+from pathlib import Path
+
+import pyarrow as pa
+import pytest
+
+from sources.tables.times import ASSUMED, TimeColumn, TimeReader
+
+SPELLINGS = (Path(__file__).parent / "spellings.csv").read_text("utf-8").splitlines()[1:]
+MOMENT_NS = 1_710_489_600 * 10**9  # 2024-03-15T08:00:00Z by `date -u +%s`
+
+
+def read(*cells: str, **column: str) -> list[int | None]:
+    """Return the time (ns) of each cell, None of one that is refused."""
+    t, known = TimeReader(TimeColumn("t", **column)).read(list(cells))
+    return [value if there else None for value, there in zip(t.tolist(), known.tolist(), strict=True)]
+
+
+@pytest.mark.parametrize("cell", SPELLINGS)
+def test_a_spelling_is_the_moment_that_it_names(cell):
+    assert read(cell) == [MOMENT_NS]
+
+
+@pytest.mark.parametrize(
+    "cell",
+    [
+        "Fri Mar 15 08:00:00 CST 2024",  # in Chicago or Shanghai
+        "2024-03-15 08:00:00 CET+1",
+        "2024-03-15T08:00:00[Europe/Berlin]",  # no offset
+        "15.03.2024 08.30",  # half past eight, or 08.30 h
+        "15.03.2024 08:00:00:05",  # 5 of which unit
+        "30 February 2024 08:00:00",
+        "15 March 2024 24:30:00",
+        "15 March 2024 13:00 PM",
+        "15 Brumaire 2024 08:00:00",
+        "15 March 08:00:00",
+        "March 2024",
+        "2024-366-1",
+        "2023-366T08:00:00",
+        "2024-000T08:00:00",
+        "15-03/2024",
+        "1.15.03.2024 08:00:00",
+        "48765432100",  # s in the year 3515; ms in 1971
+        "1_000",
+        "inf",
+    ],
+)
+def test_a_spelling_that_may_be_two_moments_or_none_is_refused(cell):
+    assert read(cell) == [None]
+
+
+FORMATS = (
+    "%a, %d %b %Y %H:%M:%S +0000",
+    "%a %b %d %H:%M:%S UTC %Y",
+    "%b %d, %Y %I:%M:%S %p",
+    "%A, %B %d, %Y %I:%M:%S %p",
+    "%d %B %Y %H:%M:%S.%f",
+    "%d-%b-%y %H.%M.%S.%f",
+    "%d.%m.%Y %H.%M.%S",
+    "%d.%m.%Y %H:%M:%S,%f",
+    "%Y-%m-%d %H:%M:%S.%f UTC",
+    "%Y/%m/%d-%H:%M:%S",
+    "%Y-%jT%H:%M:%S",
+    "%Y%m%d_%H%M%S",
+    "%Y%m%d%H%M%S",
+    "%Y-%m-%d_%H-%M-%S",
+)
+
+
+@pytest.mark.parametrize("form", FORMATS)
+def test_dates_as_strftime_writes_them(form):
+    rng = random.Random(form)
+    step = timedelta(microseconds=1) if "%f" in form else timedelta(seconds=1)
+    since = [rng.randrange(timedelta(days=15_000) // step) * step for _ in range(300)]
+    moments = [datetime(2000, 1, 1, tzinfo=UTC) + each for each in since]
+    expected = [(946_684_800 * 10**6 + each // timedelta(microseconds=1)) * 1000 for each in since]
+    assert read(*(moment.strftime(form) for moment in moments)) == expected
+
+
+@pytest.mark.parametrize(("unit", "factor"), [("ms", 10**6), ("us", 10**3), ("ns", 1)])
+def test_the_unit_of_times_since_1970_is_told(unit, factor):
+    """A column of integers and text alike; the first number decides for all, so a later small one is small."""
+    numbers = [MOMENT_NS // factor + k for k in (0, 7, 1_000_000)]
+    for cells in (list(map(str, numbers)), pa.array(numbers), pa.array(map(float, numbers))):
+        times = TimeReader(TimeColumn("stamp"))
+        t, known = times.read(cells)
+        near = 256 if factor == 1 and not isinstance(cells, list) and pa.types.is_floating(cells.type) else 0
+        assert known.all() and all(abs(a - b * factor) <= near for a, b in zip(t.tolist(), numbers, strict=True))
+        text = f"stamp is {numbers[0]}, taken as {unit} since 1970 (2024-03-15 08:00 UTC); set the time's unit"
+        assert [(row, key, note.startswith(text)) for row, key, note in times.notes] == [(0, ASSUMED, True)]
+
+
+def test_seconds_that_grow_stay_seconds():
+    assert read("1.5", "1710489600000") == [1_500_000_000, None]
+
+
+def test_the_months_of_a_two_digit_year_are_told_by_its_formats():
+    from estimators.errors import SourceError
+
+    with pytest.raises(SourceError, match='"%d/%m/%y %H:%M" or "%m/%d/%y %H:%M"'):
+        read("3/4/24 8:00")
+    assert read("3/4/24 8:00", format="%m/%d/%y %H:%M") == [1_709_539_200 * 10**9]
