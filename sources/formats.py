@@ -11,7 +11,9 @@ from estimators.errors import SourceError
 
 CAN_LOGS = (".asc", ".blf", ".csv", ".db", ".log", ".mf4", ".trc")  # Endings of CAN logs
 
-TABLES = (".csv", ".parquet", ".pq", ".mat", ".npz")
+TABLES = (".csv", ".parquet", ".pq", ".mat", ".npz", ".mf4", ".mdf", ".dat")
+
+MDF = (".mf4", ".mdf", ".dat")  # Endings of ASAM MDF, which holds signals or frames of CAN
 
 EXTRAS = {".mcap": "robotics", ".db3": "robotics"}
 """Endings of tables that a bundled extension reads, which is named where it is missing."""
@@ -97,7 +99,7 @@ BEGINNINGS = {
     b"\x89HDF": "HDF5; export it as Parquet or CSV",
     b"%PDF": "a PDF; give a CSV",
     b"RRF": "a recording of Nisus; nisus review opens it",
-    b"MDF ": "MF4; let its name end in .mf4",
+    b"MDF ": "an MDF file; let its name end in .mf4",
     b'VERSION "': "a DBC; name it with --dbc",
     b"\x89MCAP0": "an MCAP file; let its name end in .mcap",
     b"#ROSBAG V": "a bag of ROS 1; rosbags-convert makes one of ROS 2",

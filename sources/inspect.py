@@ -22,6 +22,7 @@ from .can.readers import EXTENDED, BusName, LogSummary, Raw
 from .formats import CAN_LOGS, check_once, check_present, suffix_of
 from .source import UNDATED, Channel
 from .tables.dates import CLOCK, is_day
+from .tables.mdf import holds_signals
 from .tables.order import Order, time_order
 from .tables.rows import TableRows, format_of, is_text, names_of, rows_of
 from .tables.text import NO_VALUE, QUALITY_WORD, UNREADABLE, TextMatch, csv_format, open_text
@@ -130,9 +131,11 @@ def holes(t: np.ndarray) -> list[tuple[int, int]]:
 
 
 def is_table(path: Path) -> bool:
-    """Return whether a file is read as a table; a CSV with the header of python-can is a CAN log."""
+    """Return whether a file is read as a table; CSV and MF4 may be either, by what they hold."""
     if suffix_of(path) not in CAN_LOGS:
         return True
+    if suffix_of(path) == ".mf4":
+        return holds_signals(path)
     if suffix_of(path) != ".csv":
         return False
     return csv_format(path).names[:2] != ["timestamp", "arbitration_id"]
@@ -382,7 +385,7 @@ def _sparse(
     for name, parts in cells.items():
         t, values = (np.concatenate(column) for column in zip(*parts, strict=True)) if parts else np.zeros((2, 0))
         rank = np.argsort(t, kind="stable")
-        found.append(_series(name, suffix_unit(name), t[rank].astype(np.int64), values[rank]))
+        found.append(_series(name, heading_unit(name) or suffix_unit(name), t[rank].astype(np.int64), values[rank]))
     return RecordingContents(files, "table", np.sort(np.concatenate(times)), columns=found, time=time, faults=faults)
 
 

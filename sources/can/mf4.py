@@ -42,6 +42,21 @@ def _quiet() -> Iterator[None]:
         logger.setLevel(level)
 
 
+@contextmanager
+def opened(path: Path) -> Iterator[tuple[MDF, bytes]]:
+    """Open a file: it and its bytes, as asammdf completes them; its messages are suppressed.
+
+    Raises:
+        SourceError: If nothing can be read.
+    """
+    with _quiet():
+        mdf, content = _open(path)
+        try:
+            yield mdf, content.getvalue()
+        finally:
+            mdf.close()
+
+
 def _open(path: Path) -> tuple[MDF, BytesIO]:
     from asammdf import MDF  # Here, not above: it takes long, and most logs have other formats.
 
@@ -64,12 +79,8 @@ def read_mf4(path: Path, wanted: frozenset[int] | None, longest: int) -> Iterato
     Raises:
         SourceError: If nothing can be read.
     """
-    with _quiet():
-        mdf, content = _open(path)
-        try:
-            yield from _read(path, mdf, content, wanted, longest)
-        finally:
-            mdf.close()
+    with opened(path) as (mdf, content):
+        yield from _read(path, mdf, content, wanted, longest)
 
 
 def mf4_span(path: Path) -> Iterator[tuple[int, int]]:
@@ -78,30 +89,26 @@ def mf4_span(path: Path) -> Iterator[tuple[int, int]]:
     Raises:
         SourceError: If nothing can be read.
     """
-    with _quiet():
-        mdf, _ = _open(path)
-        try:
-            ends = []
-            for index, group in enumerate(mdf.groups):
-                if group.channel_group.cycles_nr and any(c.name == "CAN_DataFrame" for c in group.channels):
-                    times = mdf.get_master(index)
-                    ends += [float(times[0]), float(times[-1])] if len(times) else []
-            start = _start(mdf)
-        finally:
-            mdf.close()
+    with opened(path) as (mdf, _):
+        ends = []
+        for index, group in enumerate(mdf.groups):
+            if group.channel_group.cycles_nr and any(c.name == "CAN_DataFrame" for c in group.channels):
+                times = mdf.get_master(index)
+                ends += [float(times[0]), float(times[-1])] if len(times) else []
+        start = start_of(mdf)
     if ends:
         yield start + round(min(ends) * 1e9), start + round(max(ends) * 1e9)
 
 
-def _start(mdf: MDF) -> int:
+def start_of(mdf: MDF) -> int:
     """Return the start of the file's clock, ns: start_time has the zone, abs_time the fraction of the second."""
     return int(mdf.header.start_time.timestamp() // 1) * 1_000_000_000 + int(mdf.header.abs_time) % 1_000_000_000
 
 
 def _read(
-    path: Path, mdf: MDF, content: BytesIO, wanted: frozenset[int] | None, longest: int
+    path: Path, mdf: MDF, content: bytes, wanted: frozenset[int] | None, longest: int
 ) -> Iterator[Raw | LogSummary]:
-    start = _start(mdf)
+    start = start_of(mdf)
     parts: list[tuple[np.ndarray, ...]] = []
     total = errors = 0
     fault = ""
@@ -129,7 +136,7 @@ def _read(
         if len(signal) < cycles:
             marked = "marked invalid" if group.channel_group.invalidation_bytes_nr else "missing"
             fault = fault or f"{cycles - len(signal)} of {cycles} frames are {marked}"
-    fault = fault or lost_records(mdf, content.getvalue())
+    fault = fault or lost_records(mdf, content)
     if fault and not parts:
         raise unreadable(path, fault)
     seen: dict[tuple[BusName, int], int] = {}
