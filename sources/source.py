@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Generator, Mapping, Sequence
 from dataclasses import dataclass, replace
+from math import isinf
 from typing import TYPE_CHECKING, Any, NamedTuple, Protocol, TypeAlias, cast, runtime_checkable
 
 if TYPE_CHECKING:
@@ -153,7 +154,13 @@ class Condition:
     high: float
 
     def __str__(self) -> str:
-        return f"{self.signal} in {self.low:g} to {self.high:g}" if isinstance(self.signal, str) else str(self.signal)
+        if not isinstance(self.signal, str):
+            return str(self.signal)
+        if isinf(self.high):
+            return f"{self.signal} of at least {self.low:g}"
+        if isinf(self.low):
+            return f"{self.signal} of at most {self.high:g}"
+        return f"{self.signal} in {self.low:g} to {self.high:g}"
 
 
 @dataclass(frozen=True)

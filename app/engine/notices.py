@@ -14,6 +14,9 @@ from estimators.errors import ConfigError, printable, quoted
 LINE_PERIOD_S = 1.0
 """Seconds between two lines under one key; those in between are only counted, so that a flood stays readable."""
 
+EXPECTED = ("condition ", "repeats ")
+"""Keys of readings that are left out as the twin's YAML has it."""
+
 MAX_LINES = 1000
 
 MAX_ANNOTATIONS, MAX_ANNOTATION_LENGTH = 1000, 500
@@ -53,11 +56,12 @@ class Notices:
         self._number: dict[str, int] = {}
 
     def report(
-        self, key: str, text: str, level: str = "warn", *, counted: bool = True, times: int = 1, t: int | None = None
+        self, key: str, text: str, level: str = "", *, counted: bool = True, times: int = 1, t: int | None = None
     ) -> None:
         """Count under `key`, and add a line for now or the time `t` unless one of that key came within the last second.
 
         The line has a level, "info", "warn" or "error", and stands for so many `times`; without a text there is none.
+        By default it is a warning, or information if its readings are left out as expected.
         `counts` has the key unless it is counted better elsewhere: then `counted` is False.
         """
         with self._lock:
@@ -70,6 +74,7 @@ class Notices:
             more = self._counts[key] - at_count - times
             self._last[key] = (self._clock(), self._counts[key])
             self._number[key] = self._next
+            level = level or ("info" if key.startswith(EXPECTED) else "warn")
             self._add(level, text if more < 1 else f"{text} ({more} more before)", t)
 
     def count(self, key: str) -> None:

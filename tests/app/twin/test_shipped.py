@@ -8,13 +8,14 @@ from functools import lru_cache
 import numpy as np
 import pytest
 
+from app.engine.notices import Notices
 from app.twin.twin import load_twin
 from config.loader import TWINS, shipped
 from estimators.diagnostics.episodes import episodes, episodes_of, judged_rows
 from estimators.fold import fold
 from estimators.log import READING, Log, truth_of
 from estimators.track import GATED, USED
-from tests.skips import recorded
+from tests.skips import recorded, with_recording
 from tests.support import SECOND, as_log, read_all
 from tests.support import folded as advanced
 
@@ -68,6 +69,25 @@ def test_no_sensor_drops_out_in_the_first_minute(run, request):
     judged = judged._replace(events=judged.events.select(minute), track=judged.track.select(minute))
     causes = {item.cause for item in episodes_of(judged) if item.subject not in injected}
     assert not causes & {"silent", "never heard", "stale", "diverged"}
+
+
+@pytest.mark.parametrize("name", [name for name in shipped() if name not in HUGE])
+def test_its_source_begins_without_a_warning(name):
+    """What the YAML leaves out, by `valid_if` and `repeats`, is information."""
+    twin = with_recording(name)
+    notices = Notices(lambda: 0)
+    source = twin.open_source(notices.report)
+    try:
+        events, first = 0, None
+        while (batch := source.read(0.01)) is not None and events < 20_000:
+            events += len(batch)
+            first = batch.t[0] if first is None and len(batch) else first
+            if len(batch) and batch.t[-1] - first > 15 * SECOND:
+                break
+    finally:
+        source.close()
+    assert events > 1
+    assert [(line.level, line.text) for line in notices.since(0) if line.level != "info"] == []
 
 
 def test_the_motor_on_the_bus_finds_its_magnet():
