@@ -71,24 +71,43 @@ def log_of(
     model: StateSpaceModel,
     sensors: Iterable[Reads],
     inputs: Sequence[tuple[str, Signal]],
-    begin: int,
-    end: int,
+    windows: Sequence[tuple[int, int]],
     zero: int,
 ) -> Log:
-    """Return the readings of sensors and the inputs between two times, ns; seconds count from `zero`."""
-    log = Log.of(model, start=(begin - zero) * 1e-9)
-    for name, one in inputs:
-        t = one.series.t
-        # The value that holds at the begin is an event of the window as well.
-        first = max(0, int(np.searchsorted(t, begin, side="right")) - 1)
-        part = slice(first, int(np.searchsorted(t, end)))
-        log.add_inputs(np.maximum(t[part] - zero, begin - zero) * 1e-9, **{name: one.series.values[part]})
-    for reads in sensors:
-        t = reads.signal.series.t
-        part = slice(*np.searchsorted(t, (begin, end)))
-        if part.stop > part.start:
-            log.add(reads.name, (t[part] - zero) * 1e-9, reads.signal.series.values[part])
+    """Return the readings of sensors and the inputs in windows from one time to another, ns; seconds count from `zero`.
+
+    The windows are in order and do not overlap.
+    """
+    log = Log.of(model, start=(windows[0][0] - zero) * 1e-9)
+    for begin, end in windows:
+        for name, one in inputs:
+            t = one.series.t
+            # The value that holds at the begin is an event of the window as well.
+            first = max(0, int(np.searchsorted(t, begin, side="right")) - 1)
+            part = slice(first, int(np.searchsorted(t, end)))
+            log.add_inputs(np.maximum(t[part] - zero, begin - zero) * 1e-9, **{name: one.series.values[part]})
+        for reads in sensors:
+            t = reads.signal.series.t
+            part = slice(*np.searchsorted(t, (begin, end)))
+            if part.stop > part.start:
+                log.add(reads.name, (t[part] - zero) * 1e-9, reads.signal.series.values[part])
     return log
+
+
+MAX_CHECKED_READINGS = 200_000  # readings of all sensors that a fold takes, in windows over the recording
+CHECK_WINDOWS = 16  # windows, if there are more readings
+
+
+def check_windows(sensors: Sequence[Reads], end: int) -> list[tuple[int, int]]:
+    """Return the windows of a fold up to a time, ns: one, or several with `MAX_CHECKED_READINGS` readings together."""
+    t = np.concatenate([reads.signal.series.t for reads in sensors])
+    t = t[t < end]
+    if t.size <= MAX_CHECKED_READINGS:
+        return [(int(t.min()), end)]
+    t.sort()
+    each = MAX_CHECKED_READINGS // CHECK_WINDOWS
+    starts = np.linspace(0, t.size - each - 1, CHECK_WINDOWS).astype(int)
+    return [(int(t[k]), int(t[k + each])) for k in starts]
 
 
 class ModelFiles:
@@ -131,7 +150,8 @@ class DraftFold:
         used = np.array([name not in drafted.held_out for name in larger.sensor_names])
         self._tuning = replace(with_options(Tuning.of(larger), drafted.options), used=used)
         end = split.edges[-1] if fitted_only else np.iinfo(np.int64).max
-        self._log = log_of(larger, self._sensors, drafted.inputs, zero, end, zero)
+        self._windows = check_windows(self._sensors, end)
+        self._log = log_of(larger, self._sensors, drafted.inputs, self._windows, zero)
         self._fold = self._folded(self._tuning)
 
     @property
@@ -193,7 +213,10 @@ class DraftFold:
             name, count = self._sensors[int(np.argmax(failed))].name, int(failed.max())
             reason, wide = f"the estimate of {name} diverged: {count:,} measurements have no prediction; omit it", False
         start, parts = (self._split.edges[0] - self._zero) * 1e-9, len(self._split.edges) + 1
-        return DraftCheck(start, span, nis.ratio, nis.low, nis.high, tuple(found), reason, nis.words, parts, wide)
+        windows = len(self._windows)
+        return DraftCheck(
+            start, span, nis.ratio, nis.low, nis.high, tuple(found), reason, nis.words, parts, wide, windows=windows
+        )
 
     def _verdict(self, part: np.ndarray) -> NisVerdict:
         """Return the verdict on the mean NIS of some events, as `nisus fold` gives it."""

@@ -128,7 +128,8 @@ class DraftCheck(NamedTuple):
     Of more than two `parts` every other one was fitted and the others checked; `start` is where the first one ends.
     `nis` is the mean NIS per degree of freedom, with the bounds `low` and `high` of `nisus fold`. `reason` says why it
     is not consistent; empty if it is. `said` is the NIS and its position in words. `wide`: the only reason is that
-    bands are wider than needed. `refitted`: a short recording is then fitted as a whole.
+    bands are wider than needed. `refitted`: a short recording is then fitted as a whole. Of a long one some `windows`
+    are checked.
     """
 
     start: float
@@ -142,11 +143,13 @@ class DraftCheck(NamedTuple):
     parts: int = 2
     wide: bool = False
     refitted: bool = False
+    windows: int = 1
 
     @property
     def fitted_to(self) -> str:
         """The fitted and the checked parts in words."""
-        return f"{self._fitted_to}{', and fitted again to all of it' if self.refitted else ''}"
+        thinned = f" (in {self.windows} windows over the recording)" if self.windows > 1 else ""
+        return f"{self._fitted_to}{thinned}{', and fitted again to all of it' if self.refitted else ''}"
 
     @property
     def _fitted_to(self) -> str:

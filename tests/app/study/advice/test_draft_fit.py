@@ -1,6 +1,7 @@
 """A draft is fitted to the first half of a recording, or to every other eighth; its check is a fold of its YAML."""
 
 import re
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -14,7 +15,7 @@ from app.twin.log_reader import read_log
 from app.twin.twin import load_twin
 from estimators.fit.objective import FitProgress
 from estimators.log import READING
-from sources.inspect import SignalSeries, inspect_recordings
+from sources.inspect import RecordingContents, SignalSeries, inspect_recordings
 
 N = 3000
 """Rows, one a second. Of the 1,500 in the second half a share of 95 % has a standard deviation of 0.6 %."""
@@ -161,3 +162,19 @@ def test_bands_that_are_too_wide_alone_are_conservative(tmp_path):
     coverage = {one.name: one.coverage.value for one in check.sensors}
     assert coverage["second"] > 0.98 and coverage["level"] > 0.9
     assert check.wide and check.words.startswith("conservative: ")
+
+
+def test_a_long_recording_is_checked_in_windows():
+    """Of a walk of half a million rows the check takes windows of both halves, and finds it consistent."""
+    rng = np.random.default_rng(3)
+    n = 500_000
+    t = np.arange(n) * 10**8
+    walk = np.cumsum(rng.normal(0.0, 0.05, n)) + rng.normal(0.0, 0.1, n)
+    found = RecordingContents([Path("walk.csv")], "table", t, columns=[SignalSeries("level", "m", t, walk)])
+    check = fit_all(plan(found, Roles())).check
+    assert check.windows == 16 and check.reason == ""
+    assert (
+        check.fitted_to == "Fitted to the first 6.94 h, checked on the other 6.94 h (in 16 windows over the recording)"
+    )
+    assert check.sensors[0].n == 8 * 12_500
+    assert check.sensors[0].coverage.value == pytest.approx(0.95, abs=0.005)
