@@ -31,17 +31,25 @@ class CanLog(Recorded):
         files: Recordings in their order.
         decoder: Decoder of their frames.
         report: Receives error frames, damaged files, and at the end messages that were never received.
+        refuse: Whether a message of several senders is an error, once the second one is read; else it is left out.
 
     Raises:
         SourceError: If a file is missing, empty, or of no known format.
     """
 
-    def __init__(self, files: Sequence[str | os.PathLike[str]], decoder: Decoder, *, report: Report = ignore) -> None:
+    def __init__(
+        self,
+        files: Sequence[str | os.PathLike[str]],
+        decoder: Decoder,
+        *,
+        report: Report = ignore,
+        refuse: bool = True,
+    ) -> None:
         self._files = [Path(file) for file in files]
         if not self._files:
             raise SourceError("CAN log: files is empty; name at least one recording")
         self._decoder = decoder
-        self._report = report
+        self._report, self._refuse = report, refuse
         for path in self._files:
             check_log(path)
         more = f" and {len(self._files) - 1} more" if len(self._files) > 1 else ""
@@ -73,7 +81,10 @@ class CanLog(Recorded):
                 item = reader.get(self._timeout)
                 if isinstance(item, Raw):
                     self.frames += item.total
-                    batch = self._decoder.decode(self._decoder.frames_of(item))
+                    frames = self._decoder.frames_of(item)
+                    if self._refuse and self._decoder.ambiguous:
+                        raise SourceError(f"{path}: {self._decoder.ambiguous}")
+                    batch = self._decoder.decode(frames)
                     if len(batch):
                         yield batch
                 elif isinstance(item, LogSummary):
@@ -84,7 +95,7 @@ class CanLog(Recorded):
                 elif not reader.ended:
                     yield Events.empty(self._decoder.width)
         except SourceError as error:
-            if self.frames == before and path == self._files[0]:
+            if (self._refuse and self._decoder.ambiguous) or (self.frames == before and path == self._files[0]):
                 # An error of the reader names the file; one of its process does not.
                 raise error if str(path) in str(error) else unreadable(path, error) from None
             fault = str(error).removeprefix(f"{path}: ")

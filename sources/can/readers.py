@@ -47,7 +47,7 @@ def read_messages(path: Path, wanted: frozenset[int] | None, longest: int) -> It
 
     Args:
         path: The log.
-        wanted: Ids of the wanted frames, EXTENDED added; None is all.
+        wanted: Ids of the wanted frames, EXTENDED added, or their parameter groups (`group_of`); None is all.
         longest: Bytes of a frame to return.
 
     Raises:
@@ -269,7 +269,7 @@ def _columns(
                 key |= EXTENDED
             bus = message.channel
             seen[bus, key] += 1
-            if wanted is not None and key not in wanted:
+            if wanted is not None and key not in wanted and group_of(key) not in wanted:
                 continue
             if not abs(message.timestamp) <= MAX_TIME_S:
                 raise ValueError("no time")
@@ -304,7 +304,7 @@ def _selected(
     codes, counts = np.unique((block.bus << 32) + block.key, return_counts=True)
     for code, count in zip(codes.tolist(), counts.tolist(), strict=True):
         seen[code >> 32, code & 0xFFFFFFFF] += count
-    rows = np.arange(block.key.size) if wanted is None else np.flatnonzero(np.isin(block.key, list(wanted)))
+    rows = np.arange(block.key.size) if wanted is None else np.flatnonzero(is_wanted(block.key, wanted))
     numbers, inverse = np.unique(block.bus[rows], return_inverse=True)
     places = np.array([buses.setdefault(number, len(buses)) for number in numbers.tolist()], np.int64)
     data = np.zeros((rows.size, longest), np.uint8)
@@ -336,6 +336,28 @@ def _missing_end(path: Path, reader: can.io.MessageReader) -> str:
 
 EXTENDED = 1 << 31
 """Added to the arbitration id of an extended frame, so that one number identifies it."""
+
+GROUP = 1 << 30
+"""Added to a parameter group of J1939 in place of an id: priority and addresses are zero."""
+
+GROUP_BITS = 0x83FF0000, 0x83FFFF00
+"""Bits of an id that name its parameter group: of formats below 240, whose next byte is an address, and of others."""
+
+
+def group_of(key: int) -> int:
+    """Return the parameter group of an id with EXTENDED; of any other id a number that no wanted one has."""
+    return key & GROUP_BITS[key >> 16 & 0xFF >= 240] | GROUP
+
+
+def is_wanted(key: np.ndarray, wanted: frozenset[int]) -> np.ndarray:
+    """Return which ids (n,) are wanted, by themselves or by their parameter group."""
+    listed = list(wanted)
+    found = np.isin(key, listed)
+    if any(item & GROUP for item in listed):
+        groups = np.where(key >> 16 & 0xFF >= 240, key & GROUP_BITS[1], key & GROUP_BITS[0]) | GROUP
+        found |= np.isin(groups, listed)
+    return found
+
 
 CHUNK_FRAMES = 8192  # Frames of a chunk
 

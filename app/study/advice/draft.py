@@ -544,6 +544,8 @@ def _channel(name: str, one: Signal, family: Family | None = None) -> str:
     fields = {"columns": _text(column)} if one.message is None else {"message": _text(one.message)}
     if one.message is not None:
         fields["signals"] = _text(column)
+        if one.series.source is not None:
+            fields["source"] = f"{one.series.source:#04x}"
     elif one.unit != one.series.unit and not heading_unit(column):
         fields["units"] = _text(one.unit)
     if one.valid:
