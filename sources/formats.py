@@ -11,6 +11,8 @@ from estimators.errors import SourceError
 
 CAN_LOGS = (".asc", ".blf", ".csv", ".db", ".log", ".mf4", ".trc")  # Endings of CAN logs
 
+EITHER = (".csv", ".txt")  # Endings of CAN logs and of tables, which their content tells apart
+
 TABLES = (".csv", ".parquet", ".pq", ".mat", ".npz")
 
 EXTRAS = {".mcap": "robotics", ".db3": "robotics"}

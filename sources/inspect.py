@@ -16,12 +16,14 @@ import numpy as np
 from estimators.errors import SourceError, nearest, quoted
 from estimators.log import READING
 
-from .can.decoder import Decoder, load_database, same_bus
+from .can.database import load_database
+from .can.decoder import Decoder, same_bus
 from .can.ids import KnownIds
 from .can.log import CanLog, check_log, frames_reader
 from .can.readers import BusName, LogSummary, Raw
+from .can.text_logs import DATED_S, is_frames
 from .can.transport import Transport
-from .formats import CAN_LOGS, check_once, check_present, suffix_of
+from .formats import CAN_LOGS, EITHER, check_once, check_present, suffix_of
 from .source import UNDATED, Channel, ignore
 from .tables.order import Order, time_order
 from .tables.rows import TableRows, format_of, is_text, names_of, rows_of
@@ -132,12 +134,9 @@ def holes(t: np.ndarray) -> list[tuple[int, int]]:
 
 
 def is_table(path: Path) -> bool:
-    """Return whether a file is read as a table; a CSV with the header of python-can is a CAN log."""
-    if suffix_of(path) not in CAN_LOGS:
-        return True
-    if suffix_of(path) != ".csv":
-        return False
-    return csv_format(path).names[:2] != ["timestamp", "arbitration_id"]
+    """Return whether a file is read as a table; a CSV or text of frames is a CAN log."""
+    kind = suffix_of(path)
+    return not is_frames(path) if kind in EITHER else kind not in CAN_LOGS
 
 
 def inspect_recordings(
@@ -162,7 +161,9 @@ def inspect_recordings(
     for path in files:
         groups.setdefault(("table", *sorted(set(names_of(path)))) if is_table(path) else ("log",), []).append(path)
     found = [
-        _logs(group, list(databases)) if kind == "log" else _tables(group, time or TimeColumn(""))
+        _logs(group, list(databases), time.zone if time else None)
+        if kind == "log"
+        else _tables(group, time or TimeColumn(""))
         for (kind, *_), group in groups.items()
     ]
     return found[0] if len(found) == 1 else _merged(found)
@@ -190,7 +191,7 @@ def _merged(parts: list[RecordingContents]) -> RecordingContents:
     )
 
 
-def _logs(files: list[Path], databases: list[tuple[Path, BusName]]) -> RecordingContents:
+def _logs(files: list[Path], databases: list[tuple[Path, BusName]], zone: str | None) -> RecordingContents:
     found: dict[tuple[BusName, int], list[np.ndarray]] = defaultdict(list)
     whole: dict[tuple[BusName, int], list[int]] = defaultdict(list)
     faults = []
@@ -198,7 +199,7 @@ def _logs(files: list[Path], databases: list[tuple[Path, BusName]]) -> Recording
     transport = Transport(None, ignore)
     for path in files:
         check_log(path)
-        reader = frames_reader(path, None, MAX_FRAME_BYTES)
+        reader = frames_reader(path, None, MAX_FRAME_BYTES, zone)
         try:
             while not reader.ended:
                 item = reader.get(1.0)
@@ -223,7 +224,10 @@ def _logs(files: list[Path], databases: list[tuple[Path, BusName]]) -> Recording
     if errors:
         faults.append(f"{errors} error frames")
     t = np.sort(np.concatenate([part for parts in found.values() for part in parts]))
-    return RecordingContents(files, "can_log", t, _named(files, databases, found, whole, faults), faults=faults)
+    if zone is None and any(suffix_of(path) == ".asc" for path in files) and t[-1] * 1e-9 > DATED_S:
+        faults.append(f"{files[0].name}: its date has no time zone and is taken to be UTC; give one with --time-zone")
+    messages = _named(files, databases, found, whole, zone, faults)
+    return RecordingContents(files, "can_log", t, messages, time=TimeColumn("", zone=zone), faults=faults)
 
 
 def _named(
@@ -231,6 +235,7 @@ def _named(
     databases: list[tuple[Path, BusName]],
     frames: Mapping[tuple[BusName, int], list[np.ndarray]],
     whole: Mapping[tuple[BusName, int], Sequence[int]],
+    zone: str | None,
     faults: list[str],
 ) -> list[Message]:
     """Return the messages with their names and signals by the databases.
@@ -240,6 +245,7 @@ def _named(
         databases: DBC files with their buses.
         frames: Times of the frames, by bus and id.
         whole: Times of messages of several packets, by bus and id.
+        zone: Time zone of the dates of text logs.
         faults: Receives the problems.
     """
     reported: set[str] = set()
@@ -271,7 +277,7 @@ def _named(
         ]  # fmt: skip
         if not channels:
             continue
-        log = CanLog(files, Decoder([(path, bus)], channels, width=1, report=report), refuse=False)
+        log = CanLog(files, Decoder([(path, bus)], channels, width=1, report=report), refuse=False, zone=zone)
         parts = [(np.zeros(0, np.int64), np.zeros(0, np.int32), np.zeros(0))]
         try:
             while (batch := log.read(1.0)) is not None:

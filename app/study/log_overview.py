@@ -13,7 +13,8 @@ from pathlib import Path
 import numpy as np
 
 from estimators.errors import ConfigError, SourceError
-from sources.can.decoder import load_database, shown_id
+from sources.can.database import load_database
+from sources.can.decoder import shown_id
 from sources.can.ids import KnownIds
 from sources.can.readers import BusName
 from sources.inspect import Message, RecordingContents, SignalSeries, inspect_recordings, is_table

@@ -144,7 +144,8 @@ def _of_frames(
     loaded: Loaded, part: CanSection, key: Key, named: list[Channel], header: LogHeader
 ) -> tuple[str | None, list[str | None]]:
     """Return the reason why frames cannot be read, and for each channel what it lacks."""
-    from sources.can.decoder import find_messages, load_database, same_bus
+    from sources.can.database import load_database
+    from sources.can.decoder import find_messages, same_bus
     from sources.can.ids import KnownIds
 
     try:

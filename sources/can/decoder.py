@@ -2,17 +2,14 @@
 
 from __future__ import annotations
 
-import logging
 from collections import Counter
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from copy import copy
-from functools import lru_cache
 from pathlib import Path
 from typing import NamedTuple
 
-import cantools
 import numpy as np
-from cantools.database.can import Database, Message, Signal
+from cantools.database.can import Message, Signal
 
 from estimators.errors import SourceError, nearest
 from estimators.log import READING, Events
@@ -20,9 +17,9 @@ from estimators.log import READING, Events
 from ..mapping import ABSENT, PRESENT, SHORT, ChannelMapping
 from ..source import NEVER, Channel, Report, ignore
 from ..units import declared_conversion, second_ns
-from ..worker_process import gist
 from . import sockets
-from .ids import KnownIds, MessageIds, mark_j1939, sender
+from .database import load_database
+from .ids import KnownIds, MessageIds, sender
 from .limits import SignalLimits, span_of
 from .readers import EXTENDED, GROUP, GROUP_BITS, BusName, Raw, group_of
 from .signals import extract, ordered, tabulate, vectorises
@@ -37,6 +34,10 @@ class Frames(NamedTuple):
     plan: np.ndarray
     length: np.ndarray
     data: np.ndarray
+
+
+class SendersError(SourceError):
+    """A message has several senders, and its channel names none."""
 
 
 class Decoder:
@@ -83,8 +84,8 @@ class Decoder:
         self._plan_of: dict[tuple[int, BusName], int] = {}
         self._carriers: dict[int, list[tuple[int, BusName]]] = {}
         """Ids and buses that carry a J1939 message, by its index."""
-        self.ambiguous = ""
-        """Why a message without a `source` is not used, since several senders have it; empty if there is none."""
+        self.refuse = False
+        """Whether a message of several senders, of which none is chosen, is an error; else it is reported."""
         needed = [
             ordered(message, tuple(dict.fromkeys(name for channel in channels for name in channel.needed)))
             for message, _, _, channels in self._plans
@@ -189,37 +190,26 @@ class Decoder:
         fed = ", ".join(dict.fromkeys(one.name for one in channels))
         text = f"{message.name} ({ids}) is sent by {', '.join(senders)}; "
         if len(own) == 1:
-            text += f"{fed} takes that of {own.pop()}, as the DBC has it; for another one give the channel its source"
+            text += f"{fed} takes that of {min(own)}, as the DBC has it; for another one give the channel its source"
         elif len({name[:4] for name in senders}) > 1:
             text += f"give {fed} one of them, such as source: {senders[0][:4]}"
-            self.ambiguous = text
         else:
             text += f"for {fed}, write the destination address of one of them into the id in the DBC"
-            self.ambiguous = text
+        if self.refuse and len(own) != 1:
+            raise SendersError(text)
         self._report(NEVER, text)
 
     def frames_of(self, raw: Raw) -> Frames:
         """Return the wanted frames of a log."""
+        if self._transport is not None:
+            raw = self._transport.add_to(raw)
         codes, inverse = np.unique((raw.bus << 32) + raw.key, return_inverse=True)
         keys = [(code & 0xFFFFFFFF, raw.buses[code >> 32]) for code in codes.tolist()]
-        messages = list(self._transport.take_all(raw)) if self._transport is not None else []
-        for key, bus in (*keys, *((key, bus) for _, bus, key, _ in messages)):
-            self.plan_of(key, bus)  # First all of them, since two senders exclude each other.
+        for item in keys:
+            self.plan_of(*item)  # First all of them, since two senders exclude each other.
         plan = np.array([self.plan_of(*item) for item in keys], np.int64)[inverse]
         rows = np.flatnonzero(plan >= 0)
-        frames = Frames(raw.t[rows], raw.t[rows], plan[rows], raw.length[rows], raw.data[rows])
-        messages = [item for item in messages if self.plan_of(item[2], item[1]) >= 0]
-        if not messages:
-            return frames
-        ends = np.array([row for row, *_ in messages])
-        plans = np.array([self.plan_of(key, bus) for _, bus, key, _ in messages])
-        parts = [data[: self.longest] for *_, data in messages]
-        whole = np.frombuffer(b"".join(part.ljust(self.longest, b"\0") for part in parts), np.uint8)
-        added = Frames(
-            raw.t[ends], raw.t[ends], plans, np.array([*map(len, parts)]), whole.reshape(len(parts), self.longest)
-        )
-        order = np.argsort(np.concatenate([rows, ends]), kind="stable")
-        return Frames._make(np.concatenate(columns)[order] for columns in zip(frames, added, strict=True))
+        return Frames(raw.t[rows], raw.t[rows], plan[rows], raw.length[rows], raw.data[rows])
 
     def gather(self, messages: Sequence[sockets.Message], arrivals: Sequence[int]) -> Frames:
         """Return the wanted messages of python-can, which came at `arrivals` (ns), as arrays.
@@ -366,39 +356,6 @@ def _nearest_match(item: Expected, seen: FrameCounts) -> str:
 def _list(buses: Sequence[BusName]) -> str:
     shown = ", ".join("without a name" if bus is None else str(bus) for bus in buses[:MAX_NAMED_IDS])
     return shown + (", ..." if len(buses) > MAX_NAMED_IDS else "")
-
-
-def load_database(path: Path) -> Database:
-    """Load a database file (DBC, or any other that cantools reads), cached while the file is unchanged.
-
-    Raises:
-        SourceError: If it is missing or not a database.
-    """
-    try:
-        stamp = path.stat().st_mtime_ns
-    except OSError as error:
-        raise SourceError(f"{path}: {gist(error)}; check the path of the DBC") from None
-    return _load(path, stamp)
-
-
-@lru_cache(maxsize=16)
-def _load(path: Path, stamp: int) -> Database:
-    logger = logging.getLogger("cantools")
-    level = logger.level
-    logger.setLevel(logging.ERROR)  # It warns of duplicate names, which are harmless.
-    try:
-        # Not strict: signals of DBC files in use overlap, which is harmless where they are not read.
-        database = cantools.database.load_file(path, strict=False)
-    except (cantools.database.UnsupportedDatabaseFormatError, cantools.database.Error, OSError, ValueError) as error:
-        raise SourceError(f"{path}: it cannot be read as a DBC ({gist(error)}); check that it is one") from None
-    finally:
-        logger.setLevel(level)
-    if not isinstance(database, Database):
-        raise SourceError(f"{path}: it describes no CAN messages; give a DBC")
-    protocol = database.dbc.attributes.get("ProtocolType") if database.dbc is not None else None
-    formats = database.dbc is not None and "VFrameFormat" in database.dbc.attribute_definitions
-    mark_j1939(database.messages, None if protocol is None or formats else str(protocol.value))
-    return database
 
 
 def _as_j1939(message: Message) -> Message:

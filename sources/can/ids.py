@@ -107,14 +107,3 @@ class KnownIds:
 def key_of(message: Message) -> int:
     """Return the id of a message in its database, with EXTENDED."""
     return message.frame_id | (EXTENDED if message.is_extended_frame else 0)
-
-
-def mark_j1939(messages: list[Message], protocol: str | None) -> None:
-    """Mark the extended messages of a database as those of J1939, by its protocol or the form of its ids.
-
-    They have the form if their source is the null address, which is never that of a frame.
-    """
-    extended = [message for message in messages if message.is_extended_frame]
-    if protocol == "J1939" or all(message.frame_id & 0xFF == NULL_ADDRESS for message in extended):
-        for message in extended:
-            message.protocol = "j1939"

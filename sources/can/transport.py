@@ -83,6 +83,18 @@ class Transport:
         self.counts[bus, session.key] += 1
         return session.key, b"".join(session.packets[k + 1] for k in range(session.count))[: session.size]
 
+    def add_to(self, raw: Raw) -> Raw:
+        """Return frames of a log with the messages that they complete, each after its last packet."""
+        if not (found := list(self.take_all(raw))):
+            return raw
+        rows, longest = np.array([row for row, *_ in found]), raw.data.shape[1]
+        keys, parts = [key for _, _, key, _ in found], [data[:longest] for *_, data in found]
+        content = np.frombuffer(b"".join(part.ljust(longest, b"\0") for part in parts), np.uint8).reshape(-1, longest)
+        added = raw.t[rows], np.array(keys), raw.bus[rows], np.array([*map(len, parts)]), content
+        order = np.argsort(np.append(np.arange(raw.t.size), rows), kind="stable")
+        columns = (np.concatenate(pair)[order] for pair in zip(raw[:5], added, strict=True))
+        return Raw._make((*columns, raw.buses, raw.total))
+
     def take_all(self, raw: Raw) -> Iterator[tuple[int, BusName, int, bytes]]:
         """Yield row of the last packet, bus, id and bytes of each message that frames of a log complete."""
         for row in np.flatnonzero(is_wanted(raw.key, TRANSPORT)).tolist():

@@ -354,6 +354,7 @@ def _source(
     def of(part: RecordingContents, k: int) -> list[str]:
         lines = [f"type: {part.kind}", "files:", *(f"  - {_text(_from(path, folder))}" for path in part.files)]
         if part.kind == "can_log":
+            lines += [f"zone: {_text(part.time.zone)}"] if part.time.zone else []
             lines.append("dbc:")
             for path, bus in databases:
                 where = "" if bus is None else f", channel: {bus if isinstance(bus, int) else _text(bus)}"

@@ -1,0 +1,58 @@
+"""Database files: DBC, and any other that cantools reads."""
+
+from __future__ import annotations
+
+import logging
+from functools import lru_cache
+from pathlib import Path
+
+import cantools
+from cantools.database.can import Database, Message
+
+from estimators.errors import SourceError
+
+from ..worker_process import gist
+from .ids import NULL_ADDRESS
+
+def load_database(path: Path) -> Database:
+    """Load a database file (DBC, or any other that cantools reads), cached while the file is unchanged.
+
+    Raises:
+        SourceError: If it is missing or not a database.
+    """
+    try:
+        stamp = path.stat().st_mtime_ns
+    except OSError as error:
+        raise SourceError(f"{path}: {gist(error)}; check the path of the DBC") from None
+    return _load(path, stamp)
+
+
+@lru_cache(maxsize=16)
+def _load(path: Path, stamp: int) -> Database:
+    logger = logging.getLogger("cantools")
+    level = logger.level
+    logger.setLevel(logging.ERROR)  # It warns of duplicate names, which are harmless.
+    try:
+        # Not strict: signals of DBC files in use overlap, which is harmless where they are not read.
+        database = cantools.database.load_file(path, strict=False)
+    except (cantools.database.UnsupportedDatabaseFormatError, cantools.database.Error, OSError, ValueError) as error:
+        raise SourceError(f"{path}: it cannot be read as a DBC ({gist(error)}); check that it is one") from None
+    finally:
+        logger.setLevel(level)
+    if not isinstance(database, Database):
+        raise SourceError(f"{path}: it describes no CAN messages; give a DBC")
+    protocol = database.dbc.attributes.get("ProtocolType") if database.dbc is not None else None
+    formats = database.dbc is not None and "VFrameFormat" in database.dbc.attribute_definitions
+    _mark_j1939(database.messages, None if protocol is None or formats else str(protocol.value))
+    return database
+
+
+def _mark_j1939(messages: list[Message], protocol: str | None) -> None:
+    """Mark the extended messages of a database as those of J1939, by its protocol or the form of its ids.
+
+    They have the form if their source is the null address, which is never that of a frame.
+    """
+    extended = [message for message in messages if message.is_extended_frame]
+    if protocol == "J1939" or all(message.frame_id & 0xFF == NULL_ADDRESS for message in extended):
+        for message in extended:
+            message.protocol = "j1939"
