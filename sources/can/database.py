@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import logging
+import re
 from functools import lru_cache
 from pathlib import Path
 
@@ -13,6 +14,13 @@ from estimators.errors import SourceError
 
 from ..worker_process import gist
 from .ids import NULL_ADDRESS
+
+DOUBLE_BYTES = re.compile(rb"[\x81-\xfe][\x40-\x7e\x80-\xfe]")
+USUAL_DOUBLE = re.compile(rb"[\xa1-\xa3\xb0-\xd7][\xa1-\xfe]")
+"""Characters of two bytes in GB18030, and its usual ones: the signs and the first level of GB2312."""
+
+MIN_USUAL = 0.5  # Share of usual ones among them from which on a DBC is in Chinese
+
 
 def load_database(path: Path) -> Database:
     """Load a database file (DBC, or any other that cantools reads), cached while the file is unchanged.
@@ -34,7 +42,8 @@ def _load(path: Path, stamp: int) -> Database:
     logger.setLevel(logging.ERROR)  # It warns of duplicate names, which are harmless.
     try:
         # Not strict: signals of DBC files in use overlap, which is harmless where they are not read.
-        database = cantools.database.load_file(path, strict=False)
+        encoding = encoding_of(path.read_bytes()) if path.suffix.lower() == ".dbc" else None
+        database = cantools.database.load_file(path, encoding=encoding, strict=False)
     except (cantools.database.UnsupportedDatabaseFormatError, cantools.database.Error, OSError, ValueError) as error:
         raise SourceError(f"{path}: it cannot be read as a DBC ({gist(error)}); check that it is one") from None
     finally:
@@ -45,6 +54,23 @@ def _load(path: Path, stamp: int) -> Database:
     formats = database.dbc is not None and "VFrameFormat" in database.dbc.attribute_definitions
     _mark_j1939(database.messages, None if protocol is None or formats else str(protocol.value))
     return database
+
+
+def encoding_of(content: bytes) -> str:
+    """Return the encoding of a DBC: UTF-8, GB18030 (which contains GB2312), or Windows-1252.
+
+    In a text of Windows-1252, such as `°C` or `Größe`, two bytes beyond ASCII are rarely a usual Chinese character.
+    """
+    for encoding in ("utf-8-sig", "gb18030"):
+        try:
+            content.decode(encoding)
+        except UnicodeDecodeError:
+            continue
+        pairs = DOUBLE_BYTES.findall(content)
+        usual = sum(USUAL_DOUBLE.fullmatch(pair) is not None for pair in pairs)
+        if encoding != "gb18030" or usual >= MIN_USUAL * len(pairs):
+            return encoding
+    return "cp1252"
 
 
 def _mark_j1939(messages: list[Message], protocol: str | None) -> None:
