@@ -140,17 +140,18 @@ class ColumnLines:
     """Lines of a CSV of GVRET (times in µs, a column for each byte) or CANedge (times in s, the bytes as one text)."""
 
     def __init__(self, heading: str) -> None:
-        self._heading, self._delimiter = _cells(heading), _delimiter(heading)
-        place = {name: k for k, name in enumerate(self._heading)}
+        self._heading, self._delimiter = heading.strip(), _delimiter(heading)
+        place = {name: k for k, name in enumerate(_cells(heading))}
         self._gvret = set(GVRET) <= set(place)
         self._places = [place[name] for name in (GVRET if self._gvret else CANEDGE)]
         self._remote = place.get("rtr")
 
     def __call__(self, line: str) -> can.Message | None:
         """Return the frame of a line; None if it is blank or the heading."""
-        if not line.strip() or _cells(line) == self._heading:
+        line = line.strip().removeprefix("\ufeff")
+        if not line or line == self._heading:
             return None
-        cells = line.strip().split(self._delimiter)
+        cells = line.split(self._delimiter)
         time, key, extended, bus, count, first = self._places
         size, remote = int(cells[count]), self._remote is not None and cells[self._remote] == "1"
         data = bytes.fromhex(" ".join(cells[first : first + size]) if self._gvret else cells[first])
@@ -268,7 +269,8 @@ class AscLog(can.ASCReader):
         return _stamp(self._zone, at) + float(f"0.{fraction or 0}")
 
     def _process_classic_can_frame(self, line: str, msg_kwargs: dict[str, Any]) -> can.Message:
-        if match := re.search(r"\bID = (\d+)(x?)", line):  # The first word may be a symbolic name.
+        # The first word may be a symbolic name.
+        if "ID = " in line and (match := re.search(r"\bID = (\d+)(x?)", line)):
             number = f"{int(match[1]):x}" if self._converted_base == 16 else match[1]
             line = re.sub(r"^\s*\S+", number + match[2], line)
         return super()._process_classic_can_frame(line, msg_kwargs)

@@ -113,8 +113,10 @@ class Transport:
         size, count, pgn = data[1] | data[2] << 8, data[3], int.from_bytes(data[5:8], "little")
         # A group of format below 240 is sent to the destination.
         whole = EXTENDED | key & 7 << 26 | pgn << 8 | (destination << 8 if pgn >> 8 & 0xFF < 240 else 0) | source
-        if (self._wanted is None or group_of(whole) in self._wanted) and 8 < size <= 7 * count < size + 7:
+        if self._wanted is None or group_of(whole) in self._wanted:
             self._open[pair] = _Session(whole, size, count, t)
+            if not 8 < size <= 7 * count < size + 7:
+                self._drop(pair)
 
     def _drop(self, pair: tuple[BusName, int, int]) -> None:
         session = self._open.pop(pair, None)

@@ -157,7 +157,7 @@ def test_messages_of_several_packets_decode_at_their_last_packet(tmp_path):
     got = decoded(decoder_of(path, *channels), frames)
     want = [(0, 1.15, 2001), (1, 1.15, 1001), (2, 1.16, 2002), (3, 1.16, 1002)]
     assert [(c, t / 1e9, v) for c, t, v in zip(got.channel, got.t, got.value[:, 0], strict=True)] == want
-    for suffix in (".log", ".mf4"):
+    for suffix in (".log", ".blf", ".mf4"):
         write(tmp_path / f"a{suffix}", frames)
         log = CanLog([tmp_path / f"a{suffix}"], decoder_of(path, *channels))
         np.testing.assert_array_equal(read_all(log).value, got.value)
@@ -178,6 +178,14 @@ def test_a_message_that_lacks_a_packet_is_left_out_and_counted(tmp_path, lost):
         f"PGN 65242 from source 0x00: {lost - 1} of 3 packets were received in time and in order; "
         "the message is left out"
     )
+
+
+def test_an_announcement_with_a_wrong_number_of_packets_is_counted(tmp_path):
+    reports = Reports()
+    decoder = decoder_of(database(tmp_path, [LONG]), sensor(0, "LONG", "Last"), report=reports)
+    frames = packets(payload(1))
+    frames[0].data[3] = 2
+    assert len(decoded(decoder, frames)) == 0 and reports.counts == {"incomplete message": 1}
 
 
 def test_packets_of_two_messages_are_not_joined(tmp_path):
