@@ -97,9 +97,10 @@ class Decoder:
         self._slow = np.array([not all(map(vectorises, signals)) for signals in needed], np.bool_)
         self._any_slow = bool(self._slow.any())
         self._most = max((len(signals) for signals in needed), default=1)
-        least = 8 if self._transport is not None else 0
-        self.longest = max((*(message.length for message in self._messages), least), default=8)
-        """Bytes of the longest message."""
+        self.longest = max((message.length for message in self._messages), default=8)
+        if self._transport is not None:
+            self.longest = max(self.longest, 8)
+        """Bytes of the longest message, of J1939 at least those of a packet."""
         self._mapping = ChannelMapping(
             [
                 (channels, names, [signal.unit for signal in signals])

@@ -250,8 +250,8 @@ class AscLog(can.ASCReader):
 
     def _datetime_to_timestamp(self, text: str) -> float:  # type: ignore[override]
         """Return the start of the times of a trigger block: its date if a measurement starts there, else the log's."""
-        following = next(self.file, "")
-        self.file.repeat()
+        if following := next(self.file, ""):
+            self.file.repeat()
         return (
             self._seconds(text) if "start of measurement" in following.lower() or not self._dated else self.start_time
         )

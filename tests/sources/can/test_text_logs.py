@@ -168,6 +168,12 @@ def test_the_zone_of_the_logger_applies_to_its_dates(tmp_path):
     assert got.t[0] / 1e9 == pytest.approx(SATURDAY - 7200 + 0.01, abs=1e-6)
 
 
+def test_a_trigger_block_at_the_end_is_the_end(tmp_path):
+    path = tmp_path / "a.asc"
+    path.write_text(HEADER.format(date="Sat Sep 30 15:06:13.191 2017") + FRAMES + "Begin Triggerblock Sat Sep 30 15:07")
+    assert [item[:3] for item in keys_and_times(path)[0]] == [(0, 256, 0), (0, 257, 0)]
+
+
 def test_a_date_that_cannot_be_read_is_said(tmp_path):
     path = tmp_path / "a.asc"
     path.write_text(HEADER.format(date="2017年9月30日") + FRAMES)
