@@ -3,9 +3,9 @@
 from __future__ import annotations
 
 from abc import abstractmethod
-from typing import Literal
+from typing import Annotated, Literal
 
-from pydantic import model_validator
+from pydantic import Field, model_validator
 
 from .fields import Condition, Number, Numbers, Positives, Repeats, Section, Text, Texts, one_of, refused
 
@@ -97,6 +97,8 @@ class SignalSection(ChannelSection):
     """The message's name in the DBC."""
     signals: Texts
     """Its signal's name, or a list: one for each row of the sensor. For a sensor with landmarks * is the id."""
+    source: Annotated[int, Field(strict=True, ge=0, le=253)] | None = None
+    """Source address of the sender of a J1939 message: 0x00. Default: null, the only sender on the bus."""
 
     @model_validator(mode="after")
     def _numbers(self) -> SignalSection:

@@ -197,19 +197,21 @@ class RecordingSection(Section):
     """Where to get the recording, shown when it is absent."""
 
 
-class CanLogSection(SignalMaps, RecordingSection):
-    """A recorded CAN log: MF4, BLF, ASC, TRC, candump (.log), CSV or SQLite (.db)."""
-
-    type: Literal["can_log"]
-    """can_log"""
-
-
 def _known_zone(name: str) -> str:
     try:
         ZoneInfo(name)
     except (ZoneInfoNotFoundError, ValueError, OSError):
         raise refused("value", f"is no time zone of this machine; {nearest(name, available_timezones())}") from None
     return name
+
+
+class CanLogSection(SignalMaps, RecordingSection):
+    """A recorded CAN log: MF4, BLF, ASC, TRC, candump, CSV (python-can, GVRET, CANedge) or SQLite (.db)."""
+
+    type: Literal["can_log"]
+    """can_log"""
+    zone: Annotated[str, AfterValidator(_known_zone)] | None = None
+    """Time zone of dates in text logs, which have none there: Europe/Berlin. Default: null, UTC."""
 
 
 def _known_date(text: str) -> str:

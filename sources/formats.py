@@ -11,6 +11,8 @@ from estimators.errors import SourceError
 
 CAN_LOGS = (".asc", ".blf", ".csv", ".db", ".log", ".mf4", ".trc")  # Endings of CAN logs
 
+EITHER = (".csv", ".txt")  # Endings of CAN logs and of tables, which their content tells apart
+
 TABLES = (".csv", ".parquet", ".pq", ".mat", ".npz", ".mf4", ".mdf", ".dat")
 
 MDF = (".mf4", ".mdf", ".dat")  # Endings of ASAM MDF, which holds signals or frames of CAN

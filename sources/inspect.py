@@ -6,7 +6,7 @@ import csv
 import json
 import re
 from collections import Counter, defaultdict
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from itertools import islice
 from pathlib import Path
@@ -16,11 +16,15 @@ import numpy as np
 from estimators.errors import SourceError, nearest, quoted
 from estimators.log import READING
 
-from .can.decoder import Decoder, load_database, same_bus
+from .can.database import load_database
+from .can.decoder import Decoder, same_bus
+from .can.ids import KnownIds
 from .can.log import CanLog, check_log, frames_reader
-from .can.readers import EXTENDED, BusName, LogSummary, Raw
-from .formats import CAN_LOGS, check_once, check_present, suffix_of
-from .source import UNDATED, Channel
+from .can.readers import BusName, LogSummary, Raw
+from .can.text_logs import DATED_S, is_frames
+from .can.transport import Transport
+from .formats import CAN_LOGS, EITHER, check_once, check_present, suffix_of
+from .source import UNDATED, Channel, ignore
 from .tables.dates import CLOCK, is_day
 from .tables.mdf import holds_signals
 from .tables.order import Order, time_order
@@ -73,7 +77,7 @@ class SignalSeries:
     """Values of one signal or column: times (ns) and finite values, (n,); `missing` counts the others.
 
     `column` is the column of a table whose rows are of several sources, and `only` the column that names the source of
-    a row, with its name there.
+    a row, with its name there; or the signal of a J1939 message that several send, and `source` the sender's address.
     """
 
     name: str
@@ -83,6 +87,7 @@ class SignalSeries:
     missing: int = 0
     column: str = ""
     only: tuple[str, str] | None = None
+    source: int | None = None
 
 
 @dataclass(frozen=True)
@@ -131,14 +136,11 @@ def holes(t: np.ndarray) -> list[tuple[int, int]]:
 
 
 def is_table(path: Path) -> bool:
-    """Return whether a file is read as a table; CSV and MF4 may be either, by what they hold."""
-    if suffix_of(path) not in CAN_LOGS:
-        return True
-    if suffix_of(path) == ".mf4":
+    """Return whether a file is read as a table; a CSV, a text or an MF4 may be either, by what it holds."""
+    kind = suffix_of(path)
+    if kind == ".mf4":
         return holds_signals(path)
-    if suffix_of(path) != ".csv":
-        return False
-    return csv_format(path).names[:2] != ["timestamp", "arbitration_id"]
+    return not is_frames(path) if kind in EITHER else kind not in CAN_LOGS
 
 
 def inspect_recordings(
@@ -163,7 +165,9 @@ def inspect_recordings(
     for path in files:
         groups.setdefault(("table", *sorted(set(names_of(path)))) if is_table(path) else ("log",), []).append(path)
     found = [
-        _logs(group, list(databases)) if kind == "log" else _tables(group, time or TimeColumn(""))
+        _logs(group, list(databases), time.zone if time else None)
+        if kind == "log"
+        else _tables(group, time or TimeColumn(""))
         for (kind, *_), group in groups.items()
     ]
     return found[0] if len(found) == 1 else _merged(found)
@@ -191,13 +195,15 @@ def _merged(parts: list[RecordingContents]) -> RecordingContents:
     )
 
 
-def _logs(files: list[Path], databases: list[tuple[Path, BusName]]) -> RecordingContents:
+def _logs(files: list[Path], databases: list[tuple[Path, BusName]], zone: str | None) -> RecordingContents:
     found: dict[tuple[BusName, int], list[np.ndarray]] = defaultdict(list)
+    whole: dict[tuple[BusName, int], list[int]] = defaultdict(list)
     faults = []
     errors = 0
+    transport = Transport(None, ignore)
     for path in files:
         check_log(path)
-        reader = frames_reader(path, None, MAX_FRAME_BYTES)
+        reader = frames_reader(path, None, MAX_FRAME_BYTES, zone)
         try:
             while not reader.ended:
                 item = reader.get(1.0)
@@ -206,6 +212,8 @@ def _logs(files: list[Path], databases: list[tuple[Path, BusName]]) -> Recording
                         rows = np.flatnonzero(item.bus == place)
                         for key in np.unique(item.key[rows]).tolist():
                             found[bus, key].append(item.t[rows[item.key[rows] == key]])
+                    for row, bus, key, _ in transport.take_all(item) if databases else ():
+                        whole[bus, key].append(int(item.t[row]))
                 elif isinstance(item, LogSummary):
                     errors += item.errors
                     if item.fault:
@@ -219,20 +227,31 @@ def _logs(files: list[Path], databases: list[tuple[Path, BusName]]) -> Recording
         raise SourceError("; ".join(faults) or f"{files[0]}: it holds no frames")
     if errors:
         faults.append(f"{errors} error frames")
-    messages = [
-        Message(bus, key, np.sort(np.concatenate(parts)))
-        for (bus, key), parts in sorted(found.items(), key=lambda entry: (str(entry[0][0]), entry[0][1]))
-    ]
-    if databases:
-        messages = _named(files, databases, messages, faults)
-    t = np.sort(np.concatenate([message.t for message in messages]))
-    return RecordingContents(files, "can_log", t, messages, faults=faults)
+    t = np.sort(np.concatenate([part for parts in found.values() for part in parts]))
+    if zone is None and any(suffix_of(path) == ".asc" for path in files) and t[-1] * 1e-9 > DATED_S:
+        faults.append(f"{files[0].name}: its date has no time zone and is taken to be UTC; give one with --time-zone")
+    messages = _named(files, databases, found, whole, zone, faults)
+    return RecordingContents(files, "can_log", t, messages, time=TimeColumn("", zone=zone), faults=faults)
 
 
 def _named(
-    files: list[Path], databases: list[tuple[Path, BusName]], messages: list[Message], faults: list[str]
+    files: list[Path],
+    databases: list[tuple[Path, BusName]],
+    frames: Mapping[tuple[BusName, int], list[np.ndarray]],
+    whole: Mapping[tuple[BusName, int], Sequence[int]],
+    zone: str | None,
+    faults: list[str],
 ) -> list[Message]:
-    """Return the messages with their names and signals by the databases."""
+    """Return the messages with their names and signals by the databases.
+
+    Args:
+        files: The logs.
+        databases: DBC files with their buses.
+        frames: Times of the frames, by bus and id.
+        whole: Times of messages of several packets, by bus and id.
+        zone: Time zone of the dates of text logs.
+        faults: Receives the problems.
+    """
     reported: set[str] = set()
 
     def report(key: str, text: str) -> None:
@@ -240,23 +259,29 @@ def _named(
             reported.add(key)
             faults.append(text)
 
-    named: dict[int, tuple[str, Path]] = {}
-    series: dict[tuple[str, str], SignalSeries] = {}
+    named: dict[tuple[BusName, int], tuple[str, int | None]] = {}
+    series: dict[tuple[str, int | None], list[SignalSeries]] = defaultdict(list)
     for path, bus in databases:
-        by_key = {m.frame_id | (EXTENDED if m.is_extended_frame else 0): m for m in load_database(path).messages}
+        known = KnownIds(load_database(path).messages)
         mine = {}
-        for k, message in enumerate(messages):
-            if k not in named and message.key in by_key and same_bus(bus, message.bus):
-                named[k] = (by_key[message.key].name, path)
-                mine[message.key] = by_key[message.key]
+        for where, key in (*frames, *whole):
+            found = known.find(key) if (where, key) not in named and same_bus(bus, where) else None
+            if found is not None:
+                source = key & 0xFF if known.ids(found).j1939 else None
+                named[where, key] = found.name, source
+                mine[found.name, source] = found
+        senders = Counter(name for name, _ in mine)
+        every = [(one, source, signal) for (_, source), one in mine.items() for signal in one.signals]
         channels = [
-            Channel(READING, k, f"{message.name}.{signal.name}", (signal.name,), message.name)
-            for k, (message, signal) in enumerate((m, s) for m in mine.values() for s in m.signals)
-        ]
+            Channel(
+                READING, k, f"{one.name}.{signal.name}", (signal.name,), one.name,
+                source=source if senders[one.name] > 1 else None,
+            )
+            for k, (one, source, signal) in enumerate(every)
+        ]  # fmt: skip
         if not channels:
             continue
-        units = {(m.name, s.name): s.unit or "" for m in mine.values() for s in m.signals}
-        log = CanLog(files, Decoder([(path, bus)], channels, width=1, report=report))
+        log = CanLog(files, Decoder([(path, bus)], channels, width=1, report=report), refuse=False, zone=zone)
         parts = [(np.zeros(0, np.int64), np.zeros(0, np.int32), np.zeros(0))]
         try:
             while (batch := log.read(1.0)) is not None:
@@ -266,19 +291,26 @@ def _named(
         t, index, values = (np.concatenate(column) for column in zip(*parts, strict=True))
         order = np.argsort(index, kind="stable")
         edges = np.searchsorted(index[order], np.arange(len(channels) + 1))
-        for k, channel in enumerate(channels):
-            assert channel.message is not None
+        for k, ((one, source, signal), channel) in enumerate(zip(every, channels, strict=True)):
             rows = order[edges[k] : edges[k + 1]]
             rows = rows[np.argsort(t[rows], kind="stable")]
-            name = (channel.message, channel.signals[0])
-            series[name] = _series(channel.signals[0], units[name], t[rows], values[rows])
+            read = _series(signal.name, signal.unit or "", t[rows], values[rows])
+            if channel.source is not None:
+                name = f"{signal.name}_{channel.source:#04x}"
+                read = replace(read, name=name, column=signal.name, source=channel.source)
+            series[one.name, source].append(read)
+    # Frames of one sender with several priorities are one message.
+    times: dict[tuple[object, ...], list[np.ndarray]] = defaultdict(list)
+    first: dict[tuple[object, ...], tuple[BusName, int]] = {}
+    for item in sorted({*frames, *(item for item in whole if item in named)}, key=lambda one: (str(one[0]), one[1])):
+        same = (item[0], *named[item]) if item in named and named[item][1] is not None else item
+        times[same] += [*frames.get(item, ()), np.array(whole.get(item, ()) if item in named else (), np.int64)]
+        first.setdefault(same, item)
     return [
-        Message(
-            message.bus, message.key, message.t, named[k][0], tuple(v for n, v in series.items() if n[0] == named[k][0])
-        )
-        if k in named
-        else message
-        for k, message in enumerate(messages)
+        Message(*item, np.sort(np.concatenate(times[same])), named[item][0], tuple(series[named[item]]))
+        if item in named
+        else Message(*item, np.sort(np.concatenate(times[same])))
+        for same, item in first.items()
     ]
 
 

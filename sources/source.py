@@ -187,8 +187,9 @@ class Channel:
     """Mapping of signals or columns to one sensor, input or true state.
 
     `kind` is READING, INPUT or TRUTH and `index` that of the sensor, input or state. `signals` are signals of the CAN
-    `message`, or columns of a table, one for each row. A value is converted from its unit to the model's and becomes
-    scale * value + offset. `units` None means the DBC's own unit, or the model's where that is empty too.
+    `message`, of J1939 perhaps from one `source` address, or columns of a table, one for each row.
+    A value is converted from its unit to the model's and becomes scale * value + offset. `units` None means the DBC's
+    own unit, or the model's where that is empty too.
     The value is missing if a condition of `where` fails; the row or frame is ignored if one of `only` fails.
     With convert "east_north" the two signals are latitude and longitude in degrees and become metres east and north of
     `origin`, which is the first valid fix unless given. `accuracy` is reported with a sensor's measurements.
@@ -210,6 +211,7 @@ class Channel:
     origin: tuple[float, float] | None = None
     accuracy: Accuracy | None = None
     repeats: float | None = None
+    source: int | None = None
 
     def __post_init__(self) -> None:
         """Spread the defaults, and entries that are given once for all, over the rows."""

@@ -86,6 +86,7 @@ def _normal(unit: str) -> str:
     text = _SAME.get(text, text)
     for old, new in (
         ("Ohm", "ohm"),
+        ("℃", "degC"),
         ("°C", "degC"),
         ("°F", "degF"),
         ("°", "deg"),

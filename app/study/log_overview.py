@@ -13,8 +13,10 @@ from pathlib import Path
 import numpy as np
 
 from estimators.errors import ConfigError, SourceError
-from sources.can.decoder import load_database, shown_id
-from sources.can.readers import EXTENDED, BusName
+from sources.can.database import load_database
+from sources.can.decoder import shown_id
+from sources.can.ids import KnownIds
+from sources.can.readers import BusName
 from sources.inspect import Message, RecordingContents, SignalSeries, inspect_recordings, is_table
 from sources.tables.rows import names_of
 from sources.tables.times import TimeColumn
@@ -211,8 +213,8 @@ def _database(file: Path, ids: set[int]) -> DatabaseOverview:
         messages = load_database(file).messages
     except SourceError as error:
         return DatabaseOverview(str(file), 0, str(error).removeprefix(f"{file}: "))
-    keys = {message.frame_id | (EXTENDED if message.is_extended_frame else 0) for message in messages}
-    return DatabaseOverview(str(file), len(ids & keys))
+    known = KnownIds(messages)
+    return DatabaseOverview(str(file), sum(known.find(key) is not None for key in ids))
 
 
 def _of(

@@ -99,6 +99,7 @@ def channel_of(
         origin=item.origin,
         accuracy=None if own is None else Accuracy(own.names, own.std is None, own.units or (None,), own.scale),
         repeats=repeat_period(item.repeats),
+        source=item.source if isinstance(item, SignalSection) else None,
     )
 
 

@@ -144,8 +144,9 @@ def _of_frames(
     loaded: Loaded, part: CanSection, key: Key, named: list[Channel], header: LogHeader
 ) -> tuple[str | None, list[str | None]]:
     """Return the reason why frames cannot be read, and for each channel what it lacks."""
-    from sources.can.decoder import find_messages, same_bus, shown_id
-    from sources.can.readers import EXTENDED
+    from sources.can.database import load_database
+    from sources.can.decoder import find_messages, same_bus
+    from sources.can.ids import KnownIds
 
     try:
         databases = find_databases(loaded, part, key)
@@ -153,15 +154,16 @@ def _of_frames(
         names = ", ".join(Path(item.file).name for item in part.dbc)
         return f"its database {names} is not on this machine", [None] * len(named)
     lines: list[str | None] = []
+    known = KnownIds(message for path, _ in databases for message in load_database(path).messages)
     for channel in named:
         try:
             messages, bus, _ = find_messages(databases, channel)
         except SourceError as error:
             lines.append(str(error))
             continue
-        keys = [message.frame_id | (EXTENDED if message.is_extended_frame else 0) for message in messages]
-        there = any(key in keys and same_bus(bus, where) for where, key in header.frames)
-        lines.append(None if there else f"no frame of {channel.message} ({', '.join(map(shown_id, keys))})")
+        ids = [known.ids(message, channel.source) for message in messages]
+        there = any(one.fits(key) and same_bus(bus, where) for where, key in header.frames for one in ids)
+        lines.append(None if there else f"no frame of {channel.message} ({', '.join(map(str, ids))})")
     return None, lines
 
 

@@ -21,7 +21,8 @@ from estimators.log import Events
 
 from ..source import LOST_FRAMES, NEVER, Report, ignore
 from ..worker_process import gist
-from .decoder import Decoder, Expected, shown_id
+from .decoder import Decoder, Expected
+from .ids import MessageIds
 from .readers import EXTENDED, BusName
 from .sockets import FrameSocket, Message, frame_socket
 
@@ -272,7 +273,7 @@ class MessageMonitor:
         self._name, self._decoder, self._clock, self._report = name, decoder, clock, report
         self._seen: Counter[tuple[BusName, int]] = Counter()
         self._since = self._next = clock()
-        self._reported: set[int] = set()
+        self._reported: set[MessageIds] = set()
         self._silence_reported = False
         self._done = False
 
@@ -294,7 +295,7 @@ class MessageMonitor:
             self._check(waited)
 
     def _check(self, waited: float) -> None:
-        waiting = [item for item in self._decoder.expected if item.key not in self._reported]
+        waiting = [item for item in self._decoder.expected if item.ids not in self._reported]
         if not self._seen:
             if not self._silence_reported:
                 self._silence_reported = True
@@ -304,13 +305,13 @@ class MessageMonitor:
             texts = self._decoder.missing(item, self._seen, least=MIN_MULTIPLEXED_FRAMES)
             if not texts or waited < MISSING_PERIODS * item.period:
                 continue
-            self._reported.add(item.key)
+            self._reported.add(item.ids)
             for text in texts:
                 self._report(NEVER, f"{self._name}: after {waited:.0f} s {text}")
-        self._done = all(item.key in self._reported for item in waiting)
+        self._done = all(item.ids in self._reported for item in waiting)
 
     def _silence(self, waiting: list[Expected]) -> str:
-        named = ", ".join(f"{item.name} ({shown_id(item.key)})" for item in waiting[:4])
+        named = ", ".join(f"{item.name} ({item.ids})" for item in waiting[:4])
         more = ", ..." if len(waiting) > 4 else ""
         return (
             f"{self._name}: none of {named}{more} was received in {MISSING_AFTER_S:g} s; check interface, "

@@ -2,27 +2,28 @@
 
 from __future__ import annotations
 
-import logging
+from collections import Counter
 from collections.abc import Iterable, Iterator, Mapping, Sequence
-from functools import lru_cache
+from copy import copy
 from pathlib import Path
 from typing import NamedTuple
 
-import cantools
 import numpy as np
-from cantools.database.can import Database, Message, Signal
+from cantools.database.can import Message, Signal
 
 from estimators.errors import SourceError, nearest
 from estimators.log import READING, Events
 
 from ..mapping import ABSENT, PRESENT, SHORT, ChannelMapping
-from ..source import Channel, Report, ignore
+from ..source import NEVER, Channel, Report, ignore
 from ..units import declared_conversion, second_ns
-from ..worker_process import gist
 from . import sockets
+from .database import load_database
+from .ids import KnownIds, MessageIds, sender
 from .limits import SignalLimits, span_of
-from .readers import EXTENDED, BusName, Raw
+from .readers import EXTENDED, GROUP, GROUP_BITS, BusName, Raw, group_of
 from .signals import extract, ordered, tabulate, vectorises
+from .transport import TRANSPORT, Transport
 
 
 class Frames(NamedTuple):
@@ -33,6 +34,10 @@ class Frames(NamedTuple):
     plan: np.ndarray
     length: np.ndarray
     data: np.ndarray
+
+
+class SendersError(SourceError):
+    """A message has several senders, and its channel names none."""
 
 
 class Decoder:
@@ -58,19 +63,29 @@ class Decoder:
     ) -> None:
         self._report = report
         self.width = width
-        for path, _ in databases:
-            load_database(path)
-        grouped: dict[int, tuple[Message, BusName, Path, list[Channel]]] = {}
+        known = KnownIds(message for path, _ in databases for message in load_database(path).messages)
+        grouped: dict[tuple[int, int | None], tuple[Message, BusName, Path, list[Channel]]] = {}
         for channel in channels:
             messages, bus, path = find_messages(databases, channel)
             for message in messages:
-                grouped.setdefault(id(message), (message, bus, path, []))[3].append(channel)
-        self._plans = list(grouped.values())
-        self._keys = [message.frame_id | (EXTENDED if message.is_extended_frame else 0) for message, *_ in self._plans]
+                grouped.setdefault((id(message), channel.source), (message, bus, path, []))[3].append(channel)
+        self._ids = [known.ids(message, source) for (_, source), (message, *_) in zip(grouped, grouped.values())]
+        self._plans = [
+            (_as_j1939(message) if ids.j1939 else message, *others)
+            for ids, (message, *others) in zip(self._ids, grouped.values(), strict=True)
+        ]
         self._check_unique()
-        self.wanted = frozenset(self._keys)
-        """Ids of the frames that some channel needs, with EXTENDED added for extended ones."""
+        self.wanted = frozenset(ids.wanted for ids in self._ids)
+        """Ids of the frames that some channel needs, EXTENDED added, or parameter groups of J1939 (`group_of`)."""
+        self._transport = None
+        if any(ids.j1939 for ids in self._ids):
+            self._transport = Transport(self.wanted, report)
+            self.wanted |= TRANSPORT
         self._plan_of: dict[tuple[int, BusName], int] = {}
+        self._carriers: dict[int, list[tuple[int, BusName]]] = {}
+        """Ids and buses that carry a J1939 message, by its index."""
+        self.refuse = False
+        """Whether a message of several senders, of which none is chosen, is an error; else it is reported."""
         needed = [
             ordered(message, tuple(dict.fromkeys(name for channel in channels for name in channel.needed)))
             for message, _, _, channels in self._plans
@@ -83,7 +98,9 @@ class Decoder:
         self._any_slow = bool(self._slow.any())
         self._most = max((len(signals) for signals in needed), default=1)
         self.longest = max((message.length for message in self._messages), default=8)
-        """Bytes of the longest message."""
+        if self._transport is not None:
+            self.longest = max(self.longest, 8)
+        """Bytes of the longest message, of J1939 at least those of a packet."""
         self._mapping = ChannelMapping(
             [
                 (channels, names, [signal.unit for signal in signals])
@@ -96,22 +113,25 @@ class Decoder:
         """Channels without a value so far."""
 
     def _check_unique(self) -> None:
-        for k, key in enumerate(self._keys):
+        for k, ids in enumerate(self._ids):
             for j in range(k):
-                (one, bus, path, _), (other, other_bus, other_path, _) = self._plans[j], self._plans[k]
-                if self._keys[j] == key and same_bus(bus, other_bus):
-                    raise SourceError(
-                        f"{path.name}: {one.name} and {other.name} ({other_path.name}) have the same id "
-                        f"{key & ~EXTENDED:#x}; say on which bus each database holds, as its channel"
-                    )
+                (one, bus, path, own), (other, other_bus, other_path, _) = self._plans[j], self._plans[k]
+                if not same_bus(bus, other_bus) or not (self._ids[j].fits(ids.first) or ids.fits(self._ids[j].first)):
+                    continue
+                if one.name == other.name and path == other_path:
+                    raise SourceError(f"{own[0].name}: another channel of {one.name} has a source; give one here, too")
+                raise SourceError(
+                    f"{path.name}: {one.name} and {other.name} ({other_path.name}) have the same id "
+                    f"{ids.key & ~EXTENDED:#x}; say on which bus each database holds, as its channel"
+                )
 
     @property
     def filters(self) -> list[dict[str, int]]:
         """Filters of python-can for the wanted ids."""
         return [
             {
-                "can_id": key & ~EXTENDED,
-                "can_mask": 0x1FFFFFFF if key & EXTENDED else 0x7FF,
+                "can_id": key & ~(EXTENDED | GROUP),
+                "can_mask": _mask(key) if key & GROUP else 0x1FFFFFFF if key & EXTENDED else 0x7FF,
                 "extended": bool(key & EXTENDED),
             }
             for key in sorted(self.wanted)
@@ -121,18 +141,18 @@ class Decoder:
     def expected(self) -> list[Expected]:
         """Messages of which some channel has had no value yet, with these channels."""
         found = []
-        for key, (message, bus, _, channels) in zip(self._keys, self._plans, strict=True):
+        for ids, (message, bus, _, channels) in zip(self._ids, self._plans, strict=True):
             feeds = {c.name: c.signals for c in channels if (c.kind, c.index) in self._unfed}
             if feeds:
-                found.append(Expected(message.name, key, bus, feeds, (message.cycle_time or 0) / 1000))
+                found.append(Expected(message.name, ids, bus, feeds, (message.cycle_time or 0) / 1000))
         return found
 
-    @staticmethod
-    def missing(item: Expected, seen: FrameCounts, *, least: int = 1) -> list[str]:
+    def missing(self, item: Expected, seen: FrameCounts, *, least: int = 1) -> list[str]:
         """Describe a message whose channels have had no value; nothing if it was received fewer than `least` times."""
-        count = sum(n for (bus, key), n in seen.items() if key == item.key and same_bus(item.bus, bus))
+        counts = Counter(seen) + (self._transport.counts if self._transport is not None else Counter())
+        count = sum(n for (bus, key), n in counts.items() if item.ids.fits(key) and same_bus(item.bus, bus))
         bus = "" if count or item.bus is None else f" on bus {item.bus}"
-        what = f"{item.name} ({shown_id(item.key)}{bus})"
+        what = f"{item.name} ({item.ids}{bus})"
         if not count:
             fed = ", ".join(item.feeds)
             return [f"{what} was never received, so {fed} has no values; {_nearest_match(item, seen)}"]
@@ -148,23 +168,49 @@ class Decoder:
         try:
             return self._plan_of[key, bus]
         except KeyError:
-            fits = [k for k, known in enumerate(self._keys) if known == key and same_bus(self._plans[k][1], bus)]
+            fits = [k for k, ids in enumerate(self._ids) if ids.fits(key) and same_bus(self._plans[k][1], bus)]
             # A frame of a format without bus names may fit several messages; the first one counts.
-            plan = fits[0] if fits else -1
-            if key in self.wanted:
+            plan = min(fits, key=lambda k: self._ids[k].j1939, default=-1)
+            if key in self.wanted or group_of(key) in self.wanted:
                 self._plan_of[key, bus] = plan
+                if plan >= 0 and self._ids[plan].j1939:
+                    self._carriers.setdefault(plan, []).append((key, bus))
+                    self._choose_sender(plan)
+                    plan = self._plan_of[key, bus]
             return plan
+
+    def _choose_sender(self, plan: int) -> None:
+        """Use one sender of a J1939 message at most: the only one, or that which the database's id names."""
+        ids, (message, _, _, channels) = self._ids[plan], self._plans[plan]
+        senders = sorted({sender(key) for key, _ in self._carriers[plan]})
+        if len(senders) < 2:
+            return
+        own = {sender(key) for key, _ in self._carriers[plan] if ids.names(key)}
+        for key, bus in self._carriers[plan]:
+            self._plan_of[key, bus] = plan if len(own) == 1 and sender(key) in own else -1
+        fed = ", ".join(dict.fromkeys(one.name for one in channels))
+        text = f"{message.name} ({ids}) is sent by {', '.join(senders)}; "
+        if len(own) == 1:
+            text += f"{fed} takes that of {min(own)}, as the DBC has it; for another one give the channel its source"
+        elif len({name[:4] for name in senders}) > 1:
+            text += f"give {fed} one of them, such as source: {senders[0][:4]}"
+        else:
+            text += f"for {fed}, write the destination address of one of them into the id in the DBC"
+        if self.refuse and len(own) != 1:
+            raise SendersError(text)
+        self._report(NEVER, text)
 
     def frames_of(self, raw: Raw) -> Frames:
         """Return the wanted frames of a log."""
-        plan = np.full(raw.key.size, -1, np.int64)
-        for key in self.wanted:
-            rows = np.flatnonzero(raw.key == key)
-            for place in np.unique(raw.bus[rows]):
-                plan[rows[raw.bus[rows] == place]] = self.plan_of(key, raw.buses[place])
+        if self._transport is not None:
+            raw = self._transport.add_to(raw)
+        codes, inverse = np.unique((raw.bus << 32) + raw.key, return_inverse=True)
+        keys = [(code & 0xFFFFFFFF, raw.buses[code >> 32]) for code in codes.tolist()]
+        for item in keys:
+            self.plan_of(*item)  # First all of them, since two senders exclude each other.
+        plan = np.array([self.plan_of(*item) for item in keys], np.int64)[inverse]
         rows = np.flatnonzero(plan >= 0)
-        t = raw.t[rows]
-        return Frames(t, t, plan[rows], raw.length[rows], raw.data[rows])
+        return Frames(raw.t[rows], raw.t[rows], plan[rows], raw.length[rows], raw.data[rows])
 
     def gather(self, messages: Sequence[sockets.Message], arrivals: Sequence[int]) -> Frames:
         """Return the wanted messages of python-can, which came at `arrivals` (ns), as arrays.
@@ -175,17 +221,21 @@ class Decoder:
         wanted, longest = self.wanted, self.longest
         for k, message in enumerate(messages):
             key = message.arbitration_id | EXTENDED if message.is_extended_id else message.arbitration_id
-            if key not in wanted or message.is_error_frame or message.is_remote_frame:
+            if message.is_error_frame or message.is_remote_frame:
                 continue
-            which = self.plan_of(key, message.channel)
-            if which < 0:
+            if key not in wanted and group_of(key) not in wanted:
                 continue
-            plan.append(which)
-            t.append(second_ns(message.timestamp))
-            arrival.append(arrivals[k])
-            data = bytes(message.data[:longest])
-            length.append(len(data))
-            chunks.append(data.ljust(longest, b"\0"))
+            time, parts = second_ns(message.timestamp), [(key, bytes(message.data))]
+            if self._transport is not None and (whole := self._transport.take(message.channel, key, time, parts[0][1])):
+                parts.append(whole)
+            for part, data in parts:
+                if (which := self.plan_of(part, message.channel)) < 0:
+                    continue
+                plan.append(which)
+                t.append(time)
+                arrival.append(arrivals[k])
+                length.append(min(len(data), longest))
+                chunks.append(data[:longest].ljust(longest, b"\0"))
         numbers = (np.array(column, np.int64) for column in (t, arrival, plan, length))
         rows = np.frombuffer(bytearray().join(chunks), np.uint8).reshape(len(chunks), longest)
         return Frames._make((*numbers, rows))
@@ -265,13 +315,13 @@ MAX_NAMED_IDS = 3  # Ids, or buses, named in place of a missing one
 
 
 class Expected(NamedTuple):
-    """A message that channels need: its name, id (EXTENDED added), bus, and the channels with their signals.
+    """A message that channels need: its name, ids, bus, and the channels with their signals.
 
     `period` is its cycle time by the DBC in seconds, 0 if the DBC has none.
     """
 
     name: str
-    key: int
+    ids: MessageIds
     bus: BusName
     feeds: Mapping[str, Sequence[str]]
     period: float
@@ -287,14 +337,18 @@ def _nearest_match(item: Expected, seen: FrameCounts) -> str:
     if not seen:
         return "no frame was received at all"
     buses = sorted({bus for bus, _ in seen}, key=str)
-    other = sorted({bus for bus, key in seen if key == item.key}, key=str)
+    own = item.ids.key
+    other = sorted({bus for bus, key in seen if item.ids.fits(key)}, key=str)
     if other:
         return f"its id was received on bus {_list(other)}; check the DBC's channel"
-    if any(key == item.key ^ EXTENDED for _, key in seen):
-        kind = "standard" if item.key & EXTENDED else "extended"
-        return f"its id was received as a {kind} one, {shown_id(item.key ^ EXTENDED)}; check the id in the DBC"
+    if any(key == own ^ EXTENDED for _, key in seen):
+        kind = "standard" if own & EXTENDED else "extended"
+        return f"its id was received as a {kind} one, {shown_id(own ^ EXTENDED)}; check the id in the DBC"
     ids = {key for _, key in seen}
-    near = sorted(ids, key=lambda key: (abs(key - item.key), key))[:MAX_NAMED_IDS]
+    if senders := sorted({f"{key & 0xFF:#04x}" for key in ids if own & EXTENDED and group_of(key) == group_of(own)}):
+        text = f"its PGN was received from {', '.join(senders[:MAX_NAMED_IDS])}; "
+        return text + f"if that is the message of J1939, give the channel source: {senders[0]}"
+    near = sorted(ids, key=lambda key: (abs(key - own), key))[:MAX_NAMED_IDS]
     there = f"there are {len(ids)} ids" if len(ids) > 1 else "there is one id"
     on = f" on bus {_list(buses)}" if buses != [None] else ""
     return f"{there}{on}, the nearest {', '.join(map(shown_id, near))}; check the DBC"
@@ -305,38 +359,18 @@ def _list(buses: Sequence[BusName]) -> str:
     return shown + (", ..." if len(buses) > MAX_NAMED_IDS else "")
 
 
-def load_database(path: Path) -> Database:
-    """Load a database file (DBC, or any other that cantools reads), cached while the file is unchanged.
-
-    Raises:
-        SourceError: If it is missing or not a database.
-    """
-    try:
-        stamp = path.stat().st_mtime_ns
-    except OSError as error:
-        raise SourceError(f"{path}: {gist(error)}; check the path of the DBC") from None
-    return _load(path, stamp)
+def _as_j1939(message: Message) -> Message:
+    """Return a message with the codes of J1939 for missing values."""
+    if message.protocol == "j1939":
+        return message
+    message = copy(message)
+    message.protocol = "j1939"
+    return message
 
 
-@lru_cache(maxsize=16)
-def _load(path: Path, stamp: int) -> Database:
-    logger = logging.getLogger("cantools")
-    level = logger.level
-    logger.setLevel(logging.ERROR)  # It warns of duplicate names, which are harmless.
-    try:
-        # Not strict: signals of DBC files in use overlap, which is harmless where they are not read.
-        database = cantools.database.load_file(path, strict=False)
-    except (cantools.database.UnsupportedDatabaseFormatError, cantools.database.Error, OSError, ValueError) as error:
-        raise SourceError(f"{path}: it cannot be read as a DBC ({gist(error)}); check that it is one") from None
-    finally:
-        logger.setLevel(level)
-    if not isinstance(database, Database):
-        raise SourceError(f"{path}: it describes no CAN messages; give a DBC")
-    protocol = database.dbc.attributes.get("ProtocolType") if database.dbc is not None else None
-    if protocol is not None and protocol.value == "J1939" and "VFrameFormat" not in database.dbc.attribute_definitions:
-        for message in filter(lambda message: message.is_extended_frame, database.messages):
-            message.protocol = "j1939"
-    return database
+def _mask(group: int) -> int:
+    """Return the bits of an id that name its parameter group."""
+    return GROUP_BITS[group >> 16 & 0xFF >= 240] & ~EXTENDED
 
 
 def same_bus(wanted: BusName, actual: BusName) -> bool:
@@ -365,6 +399,10 @@ def find_messages(databases: Sequence[tuple[Path, BusName]], channel: Channel) -
     for path, bus in databases:
         database = load_database(path)
         found = [message for message in database.messages if message.name == name]
+        if channel.source is not None and found:
+            if not all(message.is_extended_frame for message in found):
+                raise SourceError(f"{channel.name}: source: {name} has a standard id, without a source address")
+            found = [one for one in found if one.frame_id & 0xFF == channel.source] or found[:1]
         for message in found:
             signals = [signal.name for signal in message.signals]
             for signal in channel.needed:

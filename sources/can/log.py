@@ -14,12 +14,12 @@ import can
 from estimators.errors import SourceError
 from estimators.log import Events
 
-from ..formats import CAN_LOGS, check_present, is_compressed, suffix_of
+from ..formats import CAN_LOGS, EITHER, check_present, is_compressed, suffix_of
 from ..source import NEVER, TRUNCATED, Recorded, Report, ignore
 from ..units import second_ns
 from ..worker_process import IsolatedReader, read_isolated
 from . import check_mf4
-from .decoder import Decoder
+from .decoder import Decoder, SendersError
 from .mf4 import mf4_span, read_mf4
 from .readers import BusName, LogSummary, Raw, open_reader, read_messages, unreadable
 
@@ -31,17 +31,28 @@ class CanLog(Recorded):
         files: Recordings in their order.
         decoder: Decoder of their frames.
         report: Receives error frames, damaged files, and at the end messages that were never received.
+        refuse: Whether a message of several senders is an error, once the second one is read; else it is left out.
+        zone: Time zone of the dates of text logs; None is UTC.
 
     Raises:
         SourceError: If a file is missing, empty, or of no known format.
     """
 
-    def __init__(self, files: Sequence[str | os.PathLike[str]], decoder: Decoder, *, report: Report = ignore) -> None:
+    def __init__(
+        self,
+        files: Sequence[str | os.PathLike[str]],
+        decoder: Decoder,
+        *,
+        report: Report = ignore,
+        refuse: bool = True,
+        zone: str | None = None,
+    ) -> None:
         self._files = [Path(file) for file in files]
         if not self._files:
             raise SourceError("CAN log: files is empty; name at least one recording")
         self._decoder = decoder
-        self._report = report
+        self._report, self._zone = report, zone
+        decoder.refuse = refuse
         for path in self._files:
             check_log(path)
         more = f" and {len(self._files) - 1} more" if len(self._files) > 1 else ""
@@ -66,7 +77,7 @@ class CanLog(Recorded):
 
     def _one(self, path: Path) -> Generator[Events, None, None]:
         before = self.frames
-        reader = frames_reader(path, self._decoder.wanted, self._decoder.longest)
+        reader = frames_reader(path, self._decoder.wanted, self._decoder.longest, self._zone)
         fault = ""
         try:
             while not reader.ended:
@@ -83,6 +94,8 @@ class CanLog(Recorded):
                     fault = item.fault
                 elif not reader.ended:
                     yield Events.empty(self._decoder.width)
+        except SendersError as error:
+            raise SourceError(f"{path}: {error}") from None
         except SourceError as error:
             if self.frames == before and path == self._files[0]:
                 # An error of the reader names the file; one of its process does not.
@@ -96,9 +109,11 @@ class CanLog(Recorded):
             self._report(TRUNCATED, f"{path.name}: the file is damaged ({fault}); {count} frames were read")
 
 
-def frames_reader(path: Path, wanted: frozenset[int] | None, longest: int) -> IsolatedReader:
+def frames_reader(path: Path, wanted: frozenset[int] | None, longest: int, zone: str | None) -> IsolatedReader:
     """Return the frames of a log, read in a process of its own; arguments as those of `read_messages`."""
-    return IsolatedReader(read_mf4 if suffix_of(path) == ".mf4" else read_messages, path, wanted, longest)
+    if suffix_of(path) == ".mf4":
+        return IsolatedReader(read_mf4, path, wanted, longest)
+    return IsolatedReader(read_messages, path, wanted, longest, *(() if zone is None else (zone,)))
 
 
 def check_log(path: Path) -> None:
@@ -108,7 +123,7 @@ def check_log(path: Path) -> None:
         SourceError: If the file is missing, empty, or of no known format, or the package that reads it is missing.
     """
     check_present(path)
-    if suffix_of(path) not in CAN_LOGS or (is_compressed(path) and path.suffix.lower() != ".gz"):
+    if suffix_of(path) not in (*CAN_LOGS, *EITHER) or (is_compressed(path) and path.suffix.lower() != ".gz"):
         raise SourceError(
             f"{path}: {path.suffix or 'a bare name'} is not a CAN log format; choose from {', '.join(CAN_LOGS)}"
         )

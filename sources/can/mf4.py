@@ -21,7 +21,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from ..worker_process import gist
-from .readers import CHUNK_FRAMES, EXTENDED, BusName, LogSummary, Raw, unreadable
+from .readers import CHUNK_FRAMES, EXTENDED, BusName, LogSummary, Raw, is_wanted, unreadable
 
 if TYPE_CHECKING:
     from asammdf import MDF, Signal
@@ -172,7 +172,7 @@ def _columns(signal: Signal, start: int, wanted: frozenset[int] | None, longest:
     if extended is not None:
         key |= np.where(np.asarray(extended, np.int64) != 0, EXTENDED, 0)
     bus = np.full(key.size, NO_BUS) if buses is None else np.asarray(buses, np.int64)
-    rows = np.arange(key.size) if wanted is None else np.flatnonzero(np.isin(key, list(wanted)))
+    rows = np.arange(key.size) if wanted is None else np.flatnonzero(is_wanted(key, wanted))
     data = np.zeros((rows.size, longest), np.uint8)
     given = np.asarray(column("DataBytes"))
     if given.ndim == 2:

@@ -138,10 +138,11 @@ class Player:
 
 
 class _Frame:
-    """A message and its current values."""
+    """A message, the source address of its sender, and its current values."""
 
-    def __init__(self, message: Message) -> None:
+    def __init__(self, message: Message, source: int | None) -> None:
         self.message = message
+        self.id = message.frame_id if source is None else message.frame_id & ~0xFF | source
         self.values: dict[str, float] = {}
         for signal in message.signals:
             low, high, _ = span_of(signal)
@@ -157,7 +158,7 @@ class _Frame:
         """Return the message as a frame with its current values."""
         data = self.message.encode(self.values, strict=False)
         return can.Message(
-            arbitration_id=self.message.frame_id,
+            arbitration_id=self.id,
             is_extended_id=self.message.is_extended_frame,
             is_fd=bool(getattr(self.message, "is_fd", False)) or len(data) > 8,
             data=data,
@@ -177,7 +178,7 @@ class Encoder:
     """
 
     def __init__(self, databases: Sequence[tuple[Path, BusName]], channels: Iterable[Channel]) -> None:
-        self._frames: dict[str, _Frame] = {}
+        self._frames: dict[tuple[str, int | None], _Frame] = {}
         # By an event's kind and index: its frame and, for each row, signal, slope, offset and range of the conversion.
         self._routes: dict[tuple[int, int], tuple[_Frame, list[tuple[str, float, float, float, float]]]] = {}
         for channel in channels:
@@ -195,7 +196,7 @@ class Encoder:
             message = messages[0]
             if any(signal.multiplexer_ids for signal in message.signals):
                 raise SourceError(f"{path.name}: message {message.name} is multiplexed; it cannot be encoded")
-            frame = self._frames.setdefault(message.name, _Frame(message))
+            frame = self._frames.setdefault((message.name, channel.source), _Frame(message, channel.source))
             frame.reads = frame.reads or channel.kind == READING
             rows = []
             for signal, slope, shift in slopes(message, channel):

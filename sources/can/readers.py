@@ -24,31 +24,37 @@ from estimators.errors import SourceError
 from ..formats import suffix_of
 from ..units import second_ns
 from ..worker_process import gist
+from .text_logs import open_text_log
 
 FIRST_CHUNK_FRAMES = 256  # Frames of the first chunk, so that it arrives at once
 MAX_TIME_S = 2.0**62 / 1e9  # Distance of a valid time from 1970, s
 MAX_BAD_LINES = 100  # Lines of a text log that cannot be read, one after the other, after which the rest is left
 
 
-def open_reader(path: Path) -> can.io.MessageReader:
-    """Open a file with the reader of python-can.
+def open_reader(path: Path, zone: str | None = None) -> can.io.MessageReader:
+    """Open a file with a reader of python-can, or one like it; `zone` is the time zone of its dates, None is UTC.
 
     Raises:
-        SourceError: If it is not of the format of its name.
+        SourceError: If it is not of the format of its name, or its times cannot be used.
     """
     try:
-        return can.LogReader(path)
+        return open_text_log(path, zone) or can.LogReader(path)
+    except SourceError:
+        raise
     except Exception as error:  # noqa: BLE001  a damaged file makes python-can's readers raise anything
         raise unreadable(path, error) from None
 
 
-def read_messages(path: Path, wanted: frozenset[int] | None, longest: int) -> Iterator[Raw | LogSummary]:
+def read_messages(
+    path: Path, wanted: frozenset[int] | None, longest: int, zone: str | None = None
+) -> Iterator[Raw | LogSummary]:
     """Yield the frames of a log that python-can reads, in their order, and at last its summary.
 
     Args:
         path: The log.
-        wanted: Ids of the wanted frames, EXTENDED added; None is all.
+        wanted: Ids of the wanted frames, EXTENDED added, or their parameter groups (`group_of`); None is all.
         longest: Bytes of a frame to return.
+        zone: Time zone of the dates of a text log; None is UTC.
 
     Raises:
         SourceError: If nothing can be read.
@@ -58,7 +64,7 @@ def read_messages(path: Path, wanted: frozenset[int] | None, longest: int) -> It
     _correct_readers()
     warned = _Warnings()
     logging.getLogger("can").handlers = [warned]
-    reader = open_reader(path)
+    reader = open_reader(path, zone)
     if isinstance(reader, can.BLFReader):
         reader.__class__ = BlfBlocks
     lines = _Lines(reader.file) if isinstance(getattr(reader, "file", None), TextIOWrapper) else None
@@ -162,7 +168,7 @@ class _Lines:
 
     def __init__(self, file: TextIOWrapper) -> None:
         file.reconfigure(encoding="utf-8", errors="replace")  # comments may have any encoding
-        self._file, self._empty = file, False
+        self._file, self._empty, self._line, self._again = file, False, "", False
         self.number = 0
         """Number of the last line."""
         self.bad = 0
@@ -176,13 +182,20 @@ class _Lines:
         if self._empty:
             self._empty = False
             return "\n"
+        if self._again:
+            self._again = False
+            return self._line
         for line in self._file:
-            self.number += 1
+            self.number, self._line = self.number + 1, line
             if not (zeros := line.count("\0")):  # python-can skips such a line, or reads what is left of it
                 return line
             self.refuse(f"{zeros} of its bytes are zero")
             self._empty = False
         raise StopIteration
+
+    def repeat(self) -> None:
+        """Give the last line once more."""
+        self._again = bool(self._line)
 
     def refuse(self, error: object) -> None:
         """Count the last line as unreadable."""
@@ -269,7 +282,7 @@ def _columns(
                 key |= EXTENDED
             bus = message.channel
             seen[bus, key] += 1
-            if wanted is not None and key not in wanted:
+            if wanted is not None and key not in wanted and group_of(key) not in wanted:
                 continue
             if not abs(message.timestamp) <= MAX_TIME_S:
                 raise ValueError("no time")
@@ -304,7 +317,7 @@ def _selected(
     codes, counts = np.unique((block.bus << 32) + block.key, return_counts=True)
     for code, count in zip(codes.tolist(), counts.tolist(), strict=True):
         seen[code >> 32, code & 0xFFFFFFFF] += count
-    rows = np.arange(block.key.size) if wanted is None else np.flatnonzero(np.isin(block.key, list(wanted)))
+    rows = np.arange(block.key.size) if wanted is None else np.flatnonzero(is_wanted(block.key, wanted))
     numbers, inverse = np.unique(block.bus[rows], return_inverse=True)
     places = np.array([buses.setdefault(number, len(buses)) for number in numbers.tolist()], np.int64)
     data = np.zeros((rows.size, longest), np.uint8)
@@ -327,7 +340,7 @@ def _missing_end(path: Path, reader: can.io.MessageReader) -> str:
         page, pages = int.from_bytes(header[16:18], "big"), int.from_bytes(header[28:32], "big")
         size, whole = path.stat().st_size, (65536 if page == 1 else page) * pages
         return f"{size} of {whole} bytes are there" if whole > size else ""
-    if path.suffix.lower() in (".asc", ".csv", ".log", ".trc"):
+    if path.suffix.lower() in (".asc", ".csv", ".log", ".trc", ".txt"):
         with path.open("rb") as file:
             file.seek(-1, os.SEEK_END)
             return "" if file.read(1) in (b"\n", b"\r") else "its last line is incomplete"
@@ -336,6 +349,28 @@ def _missing_end(path: Path, reader: can.io.MessageReader) -> str:
 
 EXTENDED = 1 << 31
 """Added to the arbitration id of an extended frame, so that one number identifies it."""
+
+GROUP = 1 << 30
+"""Added to a parameter group of J1939 in place of an id: priority and addresses are zero."""
+
+GROUP_BITS = 0x83FF0000, 0x83FFFF00
+"""Bits of an id that name its parameter group: of formats below 240, whose next byte is an address, and of others."""
+
+
+def group_of(key: int) -> int:
+    """Return the parameter group of an id with EXTENDED; of any other id a number that no wanted one has."""
+    return key & GROUP_BITS[key >> 16 & 0xFF >= 240] | GROUP
+
+
+def is_wanted(key: np.ndarray, wanted: frozenset[int]) -> np.ndarray:
+    """Return which ids (n,) are wanted, by themselves or by their parameter group."""
+    listed = list(wanted)
+    found = np.isin(key, listed)
+    if any(item & GROUP for item in listed):
+        groups = np.where(key >> 16 & 0xFF >= 240, key & GROUP_BITS[1], key & GROUP_BITS[0]) | GROUP
+        found |= np.isin(groups, listed)
+    return found
+
 
 CHUNK_FRAMES = 8192  # Frames of a chunk
 

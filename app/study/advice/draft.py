@@ -354,6 +354,7 @@ def _source(
     def of(part: RecordingContents, k: int) -> list[str]:
         lines = [f"type: {part.kind}", "files:", *(f"  - {_text(_from(path, folder))}" for path in part.files)]
         if part.kind == "can_log":
+            lines += [f"zone: {_text(part.time.zone)}"] if part.time.zone else []
             lines.append("dbc:")
             for path, bus in databases:
                 where = "" if bus is None else f", channel: {bus if isinstance(bus, int) else _text(bus)}"
@@ -544,6 +545,8 @@ def _channel(name: str, one: Signal, family: Family | None = None) -> str:
     fields = {"columns": _text(column)} if one.message is None else {"message": _text(one.message)}
     if one.message is not None:
         fields["signals"] = _text(column)
+        if one.series.source is not None:
+            fields["source"] = f"{one.series.source:#04x}"
     elif one.unit != one.series.unit and not heading_unit(column):
         fields["units"] = _text(one.unit)
     if one.valid:

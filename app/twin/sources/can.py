@@ -147,7 +147,7 @@ def open_can_log(opening: Opening) -> Source:
     files = find_recording(opening.loaded, opening.section, opening.key, opening.log_files)
     decoder = make_decoder(opening)
     try:
-        return CanLog(files, decoder, report=opening.report)
+        return CanLog(files, decoder, report=opening.report, zone=getattr(opening.section, "zone", None))
     except SourceError as error:
         if opening.log_files is not None:
             raise

@@ -283,7 +283,7 @@ def test_times_keep_the_microseconds_of_a_log():
 
 
 def test_a_database_that_cantools_reads_is_read_once(tmp_path):
-    from sources.can.decoder import load_database
+    from sources.can.database import load_database
 
     path = dbc(tmp_path)
     assert load_database(path) is load_database(path)
