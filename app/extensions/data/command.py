@@ -1,0 +1,51 @@
+"""`nisus data`: the recordings of the bundled twins, and their download."""
+
+from __future__ import annotations
+
+from app.cli.prepare import attend
+from app.render.text import to_text
+from app.result import Topic, to_json
+from app.twin.sources.kind import recordings_folder
+from config.yaml_files import shown_path
+from estimators.errors import ConfigError
+
+from .arguments import DataCommand
+from .sets import find, recordings, size_text
+
+
+def data(arguments: DataCommand) -> int:
+    """List the recordings, or get one of them."""
+    found = [*recordings().values()]
+    if arguments.action == "get":
+        from .download import get  # here, as its libraries take long to load
+
+        if arguments.name is None:
+            raise ConfigError("get: name a recording or a twin; nisus data lists them")
+        found = [recording := find(arguments.name)]
+        given = [path.expanduser() for path in arguments.file]
+        origin = f"{given[0] if given else recording.as_json()['host']}, {recording.licence}"
+        work = f"{recording.name} from {origin}"
+        attend(None, lambda: get(recording, given), work, text=recording.progress)
+    elif arguments.name is not None or arguments.file:
+        raise ConfigError(f"list {arguments.name or '--file'}: only get takes a name and files: nisus data get NAME")
+    if arguments.json:
+        print(to_json([recording.as_json() for recording in found]))
+    elif arguments.action == "get":
+        print(f"{found[0].name} is in {shown_path(found[0].folder)}; nisus run {found[0].twins[0]} reads it")
+    else:
+        rows = tuple(
+            (
+                one.name,
+                ", ".join(one.twins),
+                size_text(one.bytes),
+                "no" if one.lacking else "yes",
+                one.licence,
+                one.source,
+            )
+            for one in found
+        )
+        titles = ("recording", "twins", "size", "here", "licence", "source")
+        by_hand = tuple(f"{one.name}: {one.by_hand}." for one in found if one.by_hand and one.lacking)
+        place = shown_path(recordings_folder())
+        print(to_text([Topic(f"Recordings in {place}", by_hand, titles, rows)]))
+    return 0
