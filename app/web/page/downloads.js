@@ -1,6 +1,6 @@
 // Recordings of bundled twins, from their public sources: host, size and licence, and after a second click the download.
 
-import { element, setText } from "./dom.js";
+import { element } from "./dom.js";
 import { size } from "./format.js";
 import { get, post } from "./http.js";
 
@@ -21,14 +21,13 @@ export class Downloads {
 
   take({ recordings, job }) {
     Object.assign(this, { recordings: recordings ?? this.recordings, job: job ?? this.job });
-    if (this.job?.state !== "running") return;
+    for (const [name, draw] of this.drawn) if (name === this.job?.name) draw();
     clearTimeout(this.timer);
-    this.timer = setTimeout(() => this.poll(), POLL_MS);
+    if (this.job?.state === "running") this.timer = setTimeout(() => this.poll(), POLL_MS);
   }
 
   async poll() {
     this.take(await get("api/gallery/data"));
-    for (const draw of this.drawn) draw();
     if (this.job.state === "done") this.arrived(this.twin);
   }
 
@@ -37,38 +36,25 @@ export class Downloads {
     const recording = this.recordings.find(({ twins }) => twins.includes(item.name));
     if (!recording) return null;
     const { name, host, bytes, licence, source, by_hand: byHand } = recording;
-    const text = element("p", { role: "status" });
-    const wrong = element("p", { class: "error", role: "alert" });
-    const ask = element("button", { type: "button", class: "go", "aria-label": `Get recording of ${item.name}`, onclick: () => asked(true) }, "Get recording");
-    const yes = element("button", { type: "button", class: "go", onclick: () => begin() }, "Download");
-    const no = element("button", { type: "button", class: "go", onclick: () => asked(false) }, "Not now");
-    const link = element("a", { href: source, target: "_blank", rel: "noreferrer" }, source);
-    const asked = (really) => {
-      text.replaceChildren(...(!really ? [] : byHand ? [`${byHand} `, link] : [`From ${host}: ${size(bytes)}, licence ${licence}. `, link]));
-      ask.hidden = really;
-      no.hidden = !really;
-      yes.hidden = !really || Boolean(byHand);
-      if (really) (byHand ? no : yes).focus();
-    };
+    const node = element("div", { class: "recording", role: "status" });
+    const button = (text, onclick) => element("button", { type: "button", class: "go", "aria-label": `${text}: ${item.name}`, onclick }, text);
     const begin = async () => {
       this.twin = item.name;
       const answer = await post("api/gallery/data/get", { name });
-      if (answer.error) return setText(wrong, answer.error);
-      this.take(answer);
-      for (const draw of this.drawn) draw();
+      if (answer.error) draw(false, answer.error);
+      else this.take(answer);
     };
-    const draw = () => {
-      const own = this.job?.name === name ? this.job : null;
-      const runs = own?.state === "running";
-      if (!runs && !ask.disabled) return;
-      asked(false);
-      ask.disabled = runs;
-      setText(text, runs ? `Downloading: ${own.doing} …` : "");
-      setText(wrong, own?.error ?? "");
+    const draw = (asked = false, refused = null) => {
+      const { state, doing, error } = this.job?.name === name ? this.job : {};
+      const link = element("a", { href: source, target: "_blank", rel: "noreferrer" }, source);
+      const wrong = refused ?? error;
+      if (state === "running") node.replaceChildren(`Downloading: ${doing} …`);
+      else if (asked) node.replaceChildren(byHand ?? `From ${host}: ${size(bytes)}, licence ${licence}.`, " ", link, element("div", { class: "confirm" }, byHand ? null : button("Download", begin), button("Not now", () => draw())));
+      else node.replaceChildren(wrong ? element("p", { class: "error", role: "alert" }, wrong) : "", button("Get recording", () => draw(true)));
+      if (asked) node.querySelector("button").focus();
     };
-    asked(false);
     draw();
-    this.drawn.push(draw);
-    return element("div", { class: "recording" }, text, wrong, element("div", { class: "confirm" }, ask, yes, no));
+    this.drawn.push([name, draw]);
+    return node;
   }
 }

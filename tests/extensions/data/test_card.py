@@ -83,7 +83,7 @@ def test_a_card_gets_its_recording_after_a_second_click(visit, gallery, origin):
     card.get_by_role("button", name="Get recording").click()
     card.get_by_role("button", name="Download").click()
     card.get_by_text("Downloading: ").wait_for()
-    assert card.get_by_role("button", name="Get recording").is_disabled()
+    assert card.get_by_role("button").count() == 0
     origin.wait.set()
     card.get_by_role("button", name=f"Start {TWIN}").wait_for()
     assert card.get_by_role("button", name=f"Start {TWIN}").evaluate("node => node === document.activeElement")
