@@ -25,7 +25,7 @@ class DataCommand(JsonOption):
 
     action: Annotated[Literal["list", "get"], tyro.conf.Positional] = "list"
     """What to do."""
-    name: Annotated[str | None, tyro.conf.Positional] = None
+    name: Annotated[str | None, tyro.conf.Positional, tyro.conf.arg(metavar="NAME")] = None
     """For `get`: name of a recording, or of a twin that reads it."""
     file: tuple[Path, ...] = ()
     """For `get`: files of the source, which are read instead of a download."""

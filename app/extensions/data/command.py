@@ -23,9 +23,9 @@ def data(arguments: DataCommand) -> int:
             raise ConfigError("get: name a recording or a twin; nisus data lists them")
         found = [recording := find(arguments.name)]
         given = [path.expanduser() for path in arguments.file]
-        origin = f"{given[0] if given else recording.as_json()['host']}, {recording.licence}"
-        work = f"{recording.name} from {origin}"
-        attend(None, lambda: get(recording, given), work, text=recording.progress)
+        origin = given[0] if given else recording.as_json()["host"]
+        doing = f"{recording.name} from {origin}, {recording.licence}"
+        attend(None, lambda: get(recording, given), doing, text=recording.progress)
     elif arguments.name is not None or arguments.file:
         raise ConfigError(f"list {arguments.name or '--file'}: only get takes a name and files: nisus data get NAME")
     if arguments.json:
@@ -33,19 +33,12 @@ def data(arguments: DataCommand) -> int:
     elif arguments.action == "get":
         print(f"{found[0].name} is in {shown_path(found[0].folder)}; nisus run {found[0].twins[0]} reads it")
     else:
-        rows = tuple(
-            (
-                one.name,
-                ", ".join(one.twins),
-                size_text(one.bytes),
-                "no" if one.lacking else "yes",
-                one.licence,
-                one.source,
-            )
-            for one in found
-        )
+        rows = []
+        for one in found:
+            here = "no" if one.lacking else "yes"
+            rows.append((one.name, ", ".join(one.twins), size_text(one.bytes), here, one.licence, one.source))
         titles = ("recording", "twins", "size", "here", "licence", "source")
-        by_hand = tuple(f"{one.name}: {one.by_hand}." for one in found if one.by_hand and one.lacking)
-        place = shown_path(recordings_folder())
-        print(to_text([Topic(f"Recordings in {place}", by_hand, titles, rows)]))
+        topics = [Topic(f"Recordings in {shown_path(recordings_folder())}", columns=titles, rows=tuple(rows))]
+        by_hand = tuple(f"{one.name}: {one.by_hand}" for one in found if one.by_hand and one.lacking)
+        print(to_text([*topics, Topic("Downloaded by hand", by_hand)] if by_hand else topics))
     return 0

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import shlex
 from dataclasses import dataclass, field
 from pathlib import Path
 from urllib.parse import quote, urlsplit
@@ -42,6 +43,7 @@ class Recording:
     makes: list[str]
     convert: str | None = None
     table: str | None = None
+    file: str = ""
     refused: str | None = None
     csv: dict[str, tuple[str, str]] = field(default_factory=dict)
     means: dict[str, tuple[float, float]] = field(default_factory=dict)
@@ -64,8 +66,8 @@ class Recording:
     @property
     def by_hand(self) -> str | None:
         """Instruction for a recording that is not downloaded; None for all others."""
-        command = f"nisus data get {self.twins[0]} --file FILE..."
-        return self.refused and f"{self.refused}; download it from {self.source} and give its files: {command}"
+        command = f"nisus data get {self.twins[0]} --file {shlex.quote(self.file)}"
+        return self.refused and f"{self.refused}; download {self.file} from {self.source} and give it: {command}"
 
     def progress(self) -> str:
         """Return the downloaded size, and that of the whole."""

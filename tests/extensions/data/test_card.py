@@ -91,6 +91,6 @@ def test_a_card_gets_its_recording_after_a_second_click(visit, gallery, origin):
 
     # What Nisus does not download has its source, and what to type.
     bench.get_by_role("button", name="Get recording").click()
-    bench.get_by_text("nisus data get motor_bench --file FILE...").first.wait_for()
+    bench.get_by_text("nisus data get motor_bench --file measures_v2.csv").first.wait_for()
     assert bench.get_by_role("link").get_attribute("href").startswith("https://www.kaggle.com/")
     assert bench.get_by_role("button", name="Download").count() == 0

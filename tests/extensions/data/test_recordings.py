@@ -48,7 +48,10 @@ def test_a_recording_is_converted_to_the_values_of_the_copy(name, nisus, monkeyp
     assert not listed[name]["present"] and origin.asked == []
     given = []
     if found().by_hand:
-        assert found().source in nisus.refuses("data", "get", wanted.twins[-1]) and origin.asked == []
+        line = nisus.refuses("data", "get", wanted.twins[-1])
+        assert (
+            f"from {found().source} and give it: nisus data get {wanted.twins[0]} --file" in line and origin.asked == []
+        )
         given = ["--file", *written(tmp_path / "given", contents(name, copy))]
     assert f"nisus run {wanted.twins[0]} reads it" in nisus("data", "get", wanted.twins[-1], *given).out
     assert [file for file in (tmp_path / "here").iterdir()] == [tmp_path / "here" / name]
