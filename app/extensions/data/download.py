@@ -103,7 +103,8 @@ def _resume(file: SourceFile, part: Path, url: str, output: str, _: Any) -> None
     """Download a file for pooch, from the byte at which the last attempt ended."""
     with part.open("ab", buffering=0) as arrived:
         if arrived.tell() > file.bytes:
-            arrived.truncate(0)
+            arrived.seek(0)
+            arrived.truncate()
         if (begin := arrived.tell()) < file.bytes:
             headers = {"Accept-Encoding": "identity", "Range": f"bytes={begin}-"}
             with requests.get(url, headers=headers, stream=True, timeout=TIMEOUT_S) as answer:

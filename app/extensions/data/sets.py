@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import os
 import shlex
+from contextlib import suppress
 from dataclasses import dataclass, field
 from pathlib import Path
 from urllib.parse import quote, urlsplit
@@ -71,8 +72,11 @@ class Recording:
 
     def progress(self) -> str:
         """Return the downloaded size, and that of the whole."""
-        files = [path.stat().st_size for path in self.parts.rglob("*") if path.is_file()]
-        return f"{size_text(min(sum(files), self.bytes))} of {size_text(self.bytes)}"
+        size = 0
+        with suppress(OSError):  # a file that is moved away meanwhile
+            for path in self.parts.rglob("*"):
+                size += path.stat().st_size if path.is_file() else 0
+        return f"{size_text(min(size, self.bytes))} of {size_text(self.bytes)}"
 
     def as_json(self) -> JsonObject:
         """Return the facts that a user needs before a download."""

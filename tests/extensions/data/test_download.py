@@ -71,6 +71,24 @@ def test_a_download_that_is_cut_off_goes_on(offered, origin, knows_ranges):
     assert (offered().folder / "ranges.csv").read_text().count("\n") == 501
 
 
+def test_a_partial_file_that_is_too_long_begins_again(offered, origin, monkeypatch):
+    monkeypatch.setattr(download, "RETRIES", 0)
+    written(offered().parts, {"Indoor_UWB_Input.txt.part": FIRST + b"more"})
+    get(offered())
+    assert ranges(origin) == [0] and not offered().lacking
+
+
+def test_the_progress_leaves_out_a_file_that_has_gone(offered, monkeypatch):
+    written(offered().parts, {"a": b"1" * 3000})
+
+    def gone(path, pattern):
+        yield path / "a"
+        raise FileNotFoundError(path / "b")
+
+    monkeypatch.setattr(Path, "rglob", gone)
+    assert offered().progress().startswith("3 kB of ")
+
+
 def test_a_server_that_goes_is_one_line_and_the_next_attempt_goes_on(offered, origin, nisus):
     origin.cuts = [PIECE_BYTES] * (1 + RETRIES)
     line = nisus.refuses("data", "get", TWIN)
