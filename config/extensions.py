@@ -75,6 +75,8 @@ class Extension:
     the figure to save there, or refuses; `twin`: `make(name)` draws that of the gallery, and returns its path."""
     routes: Parts = field(default_factory=dict)
     """Routes beside those of the page, by path. `make(engine)` returns one, as `app.web.http.get` does."""
+    gallery: Parts = field(default_factory=dict)
+    """Routes beside those of the gallery, by path, without a running twin. `make()` returns one."""
     panels: Parts = field(default_factory=dict)
     """Tabs of the page, by title. `make()` returns a JavaScript module, whose default export is called with the element
     of the tab and objects of the page: `{model, link, view, charts}` (`app/web/page/page.js`)."""
@@ -82,7 +84,7 @@ class Extension:
 
 Kind = Literal[
     "commands", "sources", "outputs", "receivers", "models", "corrections", "executors", "tables", "folders", "tracks",
-    "archives", "pictures", "routes", "panels",
+    "archives", "pictures", "routes", "gallery", "panels",
 ]  # fmt: skip
 RESERVED: Mapping[Kind, tuple[str, ...]] = {
     "sources": ("simulator", "can", "can_log", "table", "merged", "push"),
@@ -92,7 +94,7 @@ RESERVED: Mapping[Kind, tuple[str, ...]] = {
 }
 """Names of the core in each kind of section, which no extension may take; commands of the core come before others."""
 
-GUARDED = ("commands", "sources", "outputs", "receivers", "models", "routes", "panels")
+GUARDED = ("commands", "sources", "outputs", "receivers", "models", "routes", "gallery", "panels")
 """Kinds whose functions end in a line, not in a traceback; see `maker`."""
 
 _left_out: dict[str, str] = {}

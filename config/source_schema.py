@@ -189,8 +189,8 @@ class RecordingSection(Section):
     """Files of a recording."""
 
     folder: Text | None = None
-    """Folder of the recordings, relative to this YAML. The environment variable NISUS_DATA replaces it. Default: null,
-    `files` are relative to this YAML."""
+    """Folder of the recordings, relative to this YAML. The environment variable NISUS_DATA replaces it. If there is no
+    such folder and `get` is given, the user's cache does. Default: null, `files` are relative to this YAML."""
     files: Texts
     """The recording's files in their order; * and ? match. `--log FILE...` replaces them."""
     get: Text | None = None

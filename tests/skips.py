@@ -9,8 +9,6 @@ from typing import Any, NoReturn
 
 import pytest
 
-from tests import ROOT
-
 MISSING = {
     "recordings": "recordings are not here (see docs/recordings.md)",
     "Chromium": "Chromium is not here (Debian: apt install chromium-headless-shell; or NISUS_CHROMIUM=path)",
@@ -43,8 +41,10 @@ def program(name: str) -> str:
 
 
 def data_folder() -> Path:
-    """Return the folder of recordings, NISUS_DATA; one that does not exist where that is not set."""
-    return Path(os.environ.get("NISUS_DATA") or ROOT / "recordings")
+    """Return the folder of recordings: NISUS_DATA, else that of `nisus data get`."""
+    from app.twin.sources.kind import recordings_folder
+
+    return recordings_folder()
 
 
 def recording(*parts: str) -> Path:

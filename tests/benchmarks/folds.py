@@ -316,7 +316,7 @@ def _read_log(
     """
     folder = data_folder() / recording
     if not folder.exists():
-        raise SourceError(f"no recording in {folder}; set NISUS_DATA to the folder that holds {recording}")
+        raise SourceError(f"no recording in {folder}; to get it: nisus data get {recording}")
     files, counts = sorted(folder.glob(pattern)), {}
 
     def decoder() -> Decoder:

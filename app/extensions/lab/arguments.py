@@ -15,7 +15,7 @@ from app.cli.arguments import Flag, JsonOption, Repeated, TuningOption, Twin, Wo
 class GuardCommand(JsonOption, WorkersOption):
     """Fold archived recordings with the accepted tunings of their twins and list figures that got worse.
 
-    Without a name: the bundled twins with their bundled logs and those under NISUS_DATA. A figure is worse if it
+    Without a name: the bundled twins with their bundled logs and those on this machine. A figure is worse if it
     changed by more than chance and by more than is negligible. Exit status: 0 if nothing got worse, 1 if something
     did, 2 if a recording could not be folded. Missing recordings are reported; with CI=true they are errors.
 

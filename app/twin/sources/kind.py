@@ -201,12 +201,21 @@ def _beside(loaded: Loaded, path: Path) -> Path:
     return Path(os.path.normpath(loaded.path.absolute().parent / path))
 
 
+def recordings_folder() -> Path:
+    """Return the folder of recordings that belong to no YAML: NISUS_DATA, or one in the user's cache."""
+    cache = Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache")
+    return Path(os.environ.get(DATA) or cache / "nisus" / "recordings")
+
+
 def _root(loaded: Loaded, section: CanSection | RecordingSection) -> Path:
-    """Return the folder of a recording: NISUS_DATA in place of `folder`, where the YAML gives one."""
-    folder = section.folder if isinstance(section, RecordingSection) else None
-    if folder is None:
+    """Return the folder of a recording: NISUS_DATA in place of `folder`, where the YAML gives one.
+
+    A recording that others can `get` is in the user's cache if there is no such folder.
+    """
+    if not isinstance(section, RecordingSection) or section.folder is None:
         return _beside(loaded, Path())
-    return Path(os.environ.get(DATA) or _beside(loaded, Path(folder).expanduser()))
+    own = _beside(loaded, Path(section.folder).expanduser())
+    return recordings_folder() if os.environ.get(DATA) or (section.get and not own.is_dir()) else own
 
 
 def _absent(loaded: Loaded, key: Key, path: Path, section: CanSection | RecordingSection) -> SourceError:

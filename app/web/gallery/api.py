@@ -12,6 +12,7 @@ from starlette.responses import FileResponse, PlainTextResponse, Response
 from starlette.routing import Mount, Route
 from starlette.staticfiles import StaticFiles
 
+from config.extensions import made
 from config.loader import find
 from estimators.errors import ConfigError, NisusError, quoted
 
@@ -58,6 +59,7 @@ class GalleryApi:
             get("/api/gallery/log/draft", self._logs.drafting),
             post("/api/gallery/log/draft", self._logs.draft, status=202),
             post("/api/gallery/log/draft/stop", self._logs.stop_draft),
+            *made("gallery"),
         ]
         http_server.add_gallery(routes, Starlette(routes=[get("/", self._page_at_once)]))
 

@@ -24,6 +24,8 @@ export function compact(value, digits = 4) {
   return rounded.toExponential().replace("e+", "e");
 }
 
+export const size = (bytes) => (bytes < 1e6 ? `${Math.max(1, Math.round(bytes / 1e3))} kB` : bytes < 1e9 ? `${compact(bytes / 1e6, 3)} MB` : `${compact(bytes / 1e9, 3)} GB`);
+
 // A number of things: 1 reading, 1,200 readings.
 export const count = (number, word) => `${number.toLocaleString("en")} ${word}${number === 1 ? "" : "s"}`;
 

@@ -3,9 +3,10 @@
 
 import { keys, themeButton } from "./controls.js";
 import { $, changed, element, keyed, setAttribute, setText, showText } from "./dom.js";
+import { Downloads } from "./downloads.js";
 import { LogView } from "./dropped_log.js";
 import { drops } from "./drops.js";
-import { compact, count, spaced, span } from "./format.js";
+import { compact, count, size, spaced, span } from "./format.js";
 import { get, post } from "./http.js";
 import { card, progress, Session } from "./session.js";
 
@@ -95,8 +96,6 @@ class Recordings {
     yes.focus();
   }
 }
-
-const size = (bytes) => (bytes < 1e6 ? `${Math.max(1, Math.round(bytes / 1e3))} kB` : bytes < 1e9 ? `${compact(bytes / 1e6, 3)} MB` : `${compact(bytes / 1e9, 3)} GB`);
 
 function when(seconds) {
   const date = new Date(1000 * seconds);
@@ -222,9 +221,18 @@ async function list() {
     setText($("none"), "The twins could not be listed; reload the page.");
     throw new Error(twins.error);
   }
-  shown = twins.map((item) => card(item, { start, open }));
+  await downloads?.ask();
+  shown = twins.map((item) => card(item, { start, open, recording: downloads?.offer }));
   $("cards").replaceChildren(...shown.map((item) => item.node));
 }
+// Of a recording that has arrived: its cards can be started, the one first from which it was asked for.
+async function arrived(name) {
+  await list();
+  if (session.state) draw(session.state);
+  find();
+  shown.find((item) => item.name === name)?.node.querySelector(".start").focus();
+}
+const downloads = settings.service ? null : new Downloads(arrived);
 await list();
 if (!settings.service) commands.push(...shown.filter((item) => item.ready).map((item) => ["", `start ${item.short}`, () => start(item.name)]));
 if (session.state) draw(session.state);

@@ -65,7 +65,8 @@ export const progress = ({ doing, seconds }) => `${doing || "starting"} … ${Ma
 const brief = (name) => name.split(/[\\/]/).pop().replace(/\.ya?ml$/, "");
 const named = (items, short) => items.find((item) => brief(item.name) === short && !item.missing && !item.error);
 
-// `item` is a card of /api/gallery; `act` has start(name) and open().
+// `item` is a card of /api/gallery; `act` has start(name), open() and, where recordings can be had, recording(item), which
+// is an element for the card of a twin whose recording is missing.
 export function card(item, act) {
   const short = brief(item.name);
   const ready = !item.missing && !item.error;
@@ -78,7 +79,7 @@ export function card(item, act) {
       item.question ? element("p", { class: "question" }, item.question) : null,
       element("h2", {}, ready ? element("button", { type: "button", class: "name", onclick: () => button.click() }, short) : short), element("p", { class: "title" }, item.title),
       item.teaches ? element("p", { class: "teaches" }, item.teaches) : null,
-      reason(item),
+      reason(item), item.missing ? act.recording?.(item) : null,
     ),
     element("footer", {}, element("span", { class: "facts" }, facts), ready ? button : null),
   );

@@ -99,6 +99,14 @@ def test_nisus_data_replaces_the_folder(monkeypatch):
     assert len(of(events(twin_of(LOG)), READING)) == 3
 
 
+def test_a_recording_that_others_can_get_is_in_the_users_cache(monkeypatch):
+    monkeypatch.setenv("XDG_CACHE_HOME", "cache")
+    Path("cache/nisus").mkdir(parents=True)
+    Path("data").rename("cache/nisus/recordings")
+    assert len(of(events(twin_of(LOG)), READING)) == 3
+    assert "is not there: data/drive.log" in message(LOG.replace("  get: ask the test bench\n", ""), SourceError)
+
+
 def test_nisus_data_leaves_a_twin_without_folder_alone(monkeypatch):
     Path("a1.csv").write_text(CSV)
     monkeypatch.setenv("NISUS_DATA", "elsewhere")

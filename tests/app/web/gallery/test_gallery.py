@@ -57,7 +57,9 @@ def test_a_twin_without_its_data_says_what_it_needs(empty, tmp_path, monkeypatch
     monkeypatch.setenv("NISUS_DATA", str(tmp_path))
     cards = {card["name"]: card for card in empty.get("/api/gallery")}
     assert {name for name, card in cards.items() if card["missing"]} == RECORDED
-    assert "set NISUS_DATA" in cards["road_car"]["missing"] and "to get it: http" in cards["road_car"]["missing"]
+    assert "set NISUS_DATA" in cards["road_car"]["missing"] and cards["road_car"]["missing"].endswith(
+        "; to get it: nisus data get road_car"
+    )
     state = empty.start("battery_dmegc")
     assert state["running"] is None and "set NISUS_DATA" in state["failed"]["text"]
 
