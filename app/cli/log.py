@@ -31,6 +31,7 @@ from ..study.advice.signals import rate_of, signals
 from ..terminal import complain
 from .arguments import LogCommand as Arguments
 from .arguments import TableOptions
+from .prepare import attend
 
 MAX_LISTED = 5  # gaps and faults that are listed; the others are counted
 
@@ -93,7 +94,8 @@ def contents_of(files: tuple[Path, ...], options: TableOptions) -> RecordingCont
     if options.time and tables and not any(tables):
         raise ConfigError(f"--time {quoted(options.time)}: is for tables, and {files[0]} is a CAN log; leave it out")
     time = TimeColumn(options.time or "", options.time_unit, options.time_format, options.time_zone)
-    return inspect_recordings(files, databases, time)
+    more = f" and {len(files) - 1} more" if len(files) > 1 else ""
+    return attend(None, lambda: inspect_recordings(files, databases, time), f"reading {files[0].name}{more}")
 
 
 def databases_of(options: TableOptions) -> list[tuple[Path, BusName]]:
