@@ -136,6 +136,8 @@ def _values(mdf: MDF, place: _Place) -> np.ndarray:
 
 def holds_signals(path: Path) -> bool:
     """Return whether a file is MDF and holds no frames of CAN, by its blocks of text, which are never compressed."""
+    if not path.is_file():
+        return False  # It is reported when the file is read.
     with path.open("rb") as file:
         if file.read(4) not in (b"MDF ", b"UnFi"):
             return False

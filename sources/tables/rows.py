@@ -68,7 +68,7 @@ def format_of(path: Path) -> TableFormat | None:
         SourceError: If its extension is missing.
     """
     suffix = formats.suffix_of(path)
-    if suffix in formats.MDF and path.is_file():
+    if suffix in formats.MDF:
         from .mdf import holds_signals, mdf_names, read_mdf  # Here, not above: it imports python-can.
 
         if holds_signals(path):

@@ -14,7 +14,6 @@ from config.yaml_files import Key
 from estimators.errors import SourceError
 from estimators.events.clocks import Passed
 from estimators.log import BEFORE, Events
-from sources.formats import suffix_of, tables
 from sources.merged import MemorySource, Merged
 from sources.pieces import VALUES
 from sources.source import span_of
@@ -87,6 +86,8 @@ class OwnClock:
 
 def _shares(opening: Opening) -> list[list[Path] | None]:
     """Return the `--log` files of each part: by name, else tables to the table and logs to the CAN log."""
+    from sources.inspect import is_table  # Here, not above: few twins are merged of files that are replaced.
+
     section: MergedSection = opening.section
     shares: list[list[Path] | None] = [[] for _ in section.parts]
     for file in opening.log_files or ():
@@ -96,7 +97,7 @@ def _shares(opening: Opening) -> list[list[Path] | None]:
             if any(fnmatch.fnmatch(file.name, Path(pattern).name) for pattern in part.files)
         ]
         if not fits:
-            kind = TableSection if suffix_of(file) in tables() else CanLogSection
+            kind = TableSection if is_table(file) else CanLogSection
             fits = [k for k, part in enumerate(section.parts) if isinstance(part, kind)]
         if len(fits) != 1:
             raise SourceError(
