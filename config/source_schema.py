@@ -261,6 +261,17 @@ class TableSection(RecordingSection):
     follow: Annotated[bool, Field(strict=True)] = False
     """Whether the files are CSV that grow, or appear in the folders that `files` names, while the twin runs: each row
     is read once, files in the order of their names. Default: false."""
+    heading: Annotated[int, Field(strict=True, ge=1)] | Literal["none"] | None = None
+    """Line of a CSV, or row of a sheet, with the names of the columns; none if there is none, and they are c1, c2, ...
+    Default: null, detected."""
+    delimiter: Text | None = None
+    """Sign between the cells of a CSV; tab and space are words. Default: null, detected."""
+    decimal: Literal[".", ","] | None = None
+    """Decimal sign of a CSV; the other one separates thousands. Default: null, detected."""
+    skip: Annotated[int, Field(strict=True, ge=0)] = 0
+    """Lines before the table, which are left out; a heading is detected after them. Default: 0."""
+    sheet: Text | None = None
+    """Sheet of a workbook, or group of channels of a TDMS file. Default: null, the only one with a table."""
     truth: dict[str, ColumnSection] = {}
     """States whose true value the table holds. They are scored, never used. Of a field under its name: the array
     with a cell for each of its own; cells that a sensor reads are left out."""
