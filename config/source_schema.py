@@ -192,7 +192,8 @@ class RecordingSection(Section):
     """Folder of the recordings, relative to this YAML. The environment variable NISUS_DATA replaces it. Default: null,
     `files` are relative to this YAML."""
     files: Texts
-    """The recording's files in their order; * and ? match. `--log FILE...` replaces them."""
+    """The recording's files in their order; * and ? match. A folder or ZIP archive is all recordings in it, by name.
+    `--log FILE...` replaces them."""
     get: Text | None = None
     """Where to get the recording, shown when it is absent."""
 
@@ -243,7 +244,7 @@ class TimeColumnSection(Section):
 
 
 class TableSection(RecordingSection):
-    """A table: CSV, Parquet, MATLAB (.mat up to version 7) or NumPy (.npz); compressed if it ends in .gz, .bz2 or .zst.
+    """A table: CSV, Parquet, Arrow (.feather), MATLAB (.mat up to version 7) or NumPy (.npz), or one of these as .gz.
 
     Columns of a MATLAB file are its vectors by their names there: meas.Voltage. Those of a NumPy archive are its arrays
     whose first axis is time: speed, or t2m_K[3,5] for a cell of a field. Those of a ROS 2 bag (.mcap, .db3, or the

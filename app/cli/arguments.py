@@ -478,7 +478,8 @@ class LogCommand(JsonOption, TableOptions):
     """
 
     files: Annotated[tuple[Path, ...], tyro.conf.Positional]
-    """CAN logs (MF4, BLF, ASC, TRC, candump, CSV, SQLite) or tables (CSV, Parquet, MATLAB, NumPy), in order."""
+    """CAN logs (MF4, BLF, ASC, TRC, candump, CSV, SQLite) or tables (CSV, Parquet, Arrow, MATLAB, NumPy), in order; or
+    a folder or ZIP archive of these."""
 
 
 @dataclass(frozen=True)

@@ -1,8 +1,8 @@
-"""Parquet, MATLAB and NumPy files: their columns, and their rows a few thousand at a time.
+"""Parquet, Arrow, MATLAB and NumPy files: their columns, and their rows a few thousand at a time.
 
 The libraries that read them run in a process of their own, with limited memory (`sources/worker_process.py`).
 
-- Parquet: a column each.
+- Parquet, Arrow (Feather): a column each.
 - MATLAB up to version 7: every vector of numbers, named as in MATLAB: `meas.Voltage`, `runs(3).t` (counted from 1),
   or `speed` for a vector of its own.
 - NumPy archives: arrays whose first axis is time. A vector is a column under its own name; of an array of more axes
@@ -14,9 +14,10 @@ from __future__ import annotations
 import io
 import math
 import zipfile
-from collections.abc import Generator, Iterator, Sequence
+from collections.abc import Generator, Iterable, Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
@@ -26,6 +27,9 @@ from ..formats import is_compressed, open_binary
 from ..source import TRUNCATED
 from ..worker_process import gist, memory_error, memory_limit
 from .text import CHUNK_ROWS, Chunk, Column, Problem, TextCodes, TextMatch, column_of, fill
+
+if TYPE_CHECKING:
+    import pyarrow
 
 CHUNK_VALUES = 65_536
 """Values of a chunk of a NumPy archive; a row of a field has thousands."""
@@ -72,12 +76,42 @@ def parquet_names(path: Path, time: str = "") -> list[str]:
         return list(pyarrow.parquet.read_schema(_content(path)).names)
 
 
+def arrow_names(path: Path, time: str = "") -> list[str]:
+    """Return the columns of an Arrow file or stream (Feather); raises SourceError if it is none, or cut short."""
+    with _readable(path, "Arrow"), _arrow(path) as reader:
+        return list(reader.schema.names)
+
+
+def _arrow(path: Path) -> Any:
+    """Open an Arrow file; a stream, if it does not end as one."""
+    import pyarrow
+
+    source = pyarrow.PythonFile(content, "r") if isinstance(content := _content(path), io.BytesIO) else content
+    try:
+        return pyarrow.ipc.open_file(source)
+    except pyarrow.ArrowInvalid:
+        if isinstance(content, io.BytesIO):
+            content.seek(0)
+        return pyarrow.ipc.open_stream(source)
+
+
+def read_arrow(path: Path, time: str, columns: Sequence[Column], problem: Problem) -> Generator[Chunk, None, None]:
+    """Yield the rows of an Arrow file or stream, as those of Parquet."""
+    wanted = list(dict.fromkeys((time, *map(column_of, columns))))
+    with _readable(path, "Arrow"), _arrow(path) as reader:
+        count = getattr(reader, "num_record_batches", None)
+        whole = reader if count is None else map(reader.get_batch, range(count))
+        parts = (
+            part.select(wanted).slice(k, CHUNK_ROWS) for part in whole for k in range(0, part.num_rows, CHUNK_ROWS)
+        )
+        yield from _batches(parts, time, columns, problem)
+
+
 def read_parquet(path: Path, time: str, columns: Sequence[Column], problem: Problem) -> Generator[Chunk, None, None]:
     """Yield the rows of a Parquet file; null is blank, and text is read as in a CSV."""
-    import pyarrow
     import pyarrow.parquet
 
-    row = 1
+    row = 0
     with pyarrow.parquet.ParquetFile(_content(path)) as file:
         wanted = list(dict.fromkeys((time, *map(column_of, columns))))
         for k in range(file.num_row_groups):
@@ -85,32 +119,44 @@ def read_parquet(path: Path, time: str, columns: Sequence[Column], problem: Prob
             chunks = [group.column(j) for j in range(group.num_columns)]
             sizes = [chunk.total_uncompressed_size for chunk in chunks if chunk.path_in_schema in wanted]
             _check_size(path, sum(sizes))
-        for batch in file.iter_batches(CHUNK_ROWS, columns=wanted):
-            n = batch.num_rows
-            values = np.empty((n, len(columns)))
-            blank = np.zeros(values.shape, np.bool_)
-            lines = list(range(row, row + n))
-            words: tuple[str, ...] = ()
-            for k, name in enumerate(columns):
-                column = batch.column(column_of(name))
-                if not isinstance(name, str) or pyarrow.types.is_dictionary(column.type):
-                    column = column.cast(pyarrow.string())
-                blank[:, k] = column.is_null().to_numpy(zero_copy_only=False)
-                if isinstance(name, TextCodes):
-                    coded = column.dictionary_encode()
-                    words = tuple(coded.dictionary.to_pylist())
-                    values[:, k] = coded.indices.fill_null(-1).to_numpy(zero_copy_only=False)
-                    continue
-                if pyarrow.types.is_string(column.type) or pyarrow.types.is_large_string(column.type):
-                    cells = [item or "" for item in column.to_pylist()]
-                    fill(name, cells, lines, values[:, k], blank[:, k], problem)
-                else:
-                    numbers = column.cast(pyarrow.float64(), safe=False)
-                    values[:, k] = numbers.to_numpy(zero_copy_only=False)
-            yield Chunk(np.array(lines), batch.column(time), values, blank, words)
-            row += n
-        if row - 1 != file.metadata.num_rows:
-            problem(TRUNCATED, row, f"{row - 1} of {file.metadata.num_rows} rows are there")
+        for chunk in _batches(file.iter_batches(CHUNK_ROWS, columns=wanted), time, columns, problem):
+            yield chunk
+            row += len(chunk.line)
+        if row != file.metadata.num_rows:
+            problem(TRUNCATED, row + 1, f"{row} of {file.metadata.num_rows} rows are there")
+
+
+def _batches(
+    batches: Iterable[pyarrow.RecordBatch], time: str, columns: Sequence[Column], problem: Problem
+) -> Iterator[Chunk]:
+    """Yield the rows of batches of Arrow."""
+    import pyarrow
+
+    row = 1
+    for batch in batches:
+        n = batch.num_rows
+        values = np.empty((n, len(columns)))
+        blank = np.zeros(values.shape, np.bool_)
+        lines = list(range(row, row + n))
+        words: tuple[str, ...] = ()
+        for k, name in enumerate(columns):
+            column = batch.column(column_of(name))
+            if not isinstance(name, str) or pyarrow.types.is_dictionary(column.type):
+                column = column.cast(pyarrow.string())
+            blank[:, k] = column.is_null().to_numpy(zero_copy_only=False)
+            if isinstance(name, TextCodes):
+                coded = column.dictionary_encode()
+                words = tuple(coded.dictionary.to_pylist())
+                values[:, k] = coded.indices.fill_null(-1).to_numpy(zero_copy_only=False)
+                continue
+            if pyarrow.types.is_string(column.type) or pyarrow.types.is_large_string(column.type):
+                cells = [item or "" for item in column.to_pylist()]
+                fill(name, cells, lines, values[:, k], blank[:, k], problem)
+            else:
+                numbers = column.cast(pyarrow.float64(), safe=False)
+                values[:, k] = numbers.to_numpy(zero_copy_only=False)
+        yield Chunk(np.array(lines), batch.column(time), values, blank, words)
+        row += n
 
 
 def _numeric(path: Path, columns: Sequence[Column]) -> list[str]:

@@ -16,7 +16,7 @@ from estimators.errors import SourceError, quoted
 from .. import formats
 from ..source import UNDATED
 from ..worker_process import IsolatedReader, read_isolated
-from .binary import mat_names, npz_names, parquet_names, read_mat, read_npz, read_parquet
+from .binary import arrow_names, mat_names, npz_names, parquet_names, read_arrow, read_mat, read_npz, read_parquet
 from .dialect import DETECTED, Dialect
 from .text import Chunk, Column, csv_format, read_csv
 from .times import TimeColumn, TimeReader
@@ -39,7 +39,9 @@ class TableFormat(NamedTuple):
 
 
 _FORMATS = {
+    ".arrow": TableFormat(arrow_names, read_arrow),
     ".csv": None,
+    ".feather": TableFormat(arrow_names, read_arrow),
     ".mat": TableFormat(mat_names, read_mat),
     ".npz": TableFormat(npz_names, read_npz),
     ".parquet": TableFormat(parquet_names, read_parquet),

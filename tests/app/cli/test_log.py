@@ -184,7 +184,7 @@ def test_a_file_of_which_no_twin_can_be_drafted_is_refused_with_the_remedy(
 
 @pytest.mark.parametrize("command", ["log", "advise"])
 @pytest.mark.parametrize("name", ["folder", "folder.csv"])
-def test_a_folder_is_called_one(tmp_path, nisus, command, name):
+def test_a_folder_without_recordings_is_refused(tmp_path, nisus, command, name):
     (tmp_path / name).mkdir()
     said = nisus.refuses(command, str(tmp_path / name))
-    assert f"{name}: it is a folder; name " in said
+    assert f"{name}: holds no recording; name a file that ends in .csv" in said
