@@ -16,7 +16,9 @@ CAN_LOGS = (".asc", ".blf", ".csv", ".db", ".log", ".mf4", ".trc")  # Endings of
 
 TABLES = (".csv", ".parquet", ".pq", ".feather", ".arrow", ".mat", ".npz")
 
-EXTRAS = {".mcap": "robotics", ".db3": "robotics"}
+EXTRAS = {
+    ".mcap": "robotics", ".db3": "robotics", ".xlsx": "excel", ".xls": "excel", ".ods": "excel", ".tdms": "tdms",
+}  # fmt: skip
 """Endings of tables that a bundled extension reads, which is named where it is missing."""
 
 ZIP = ".zip"

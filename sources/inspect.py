@@ -22,8 +22,8 @@ from .formats import CAN_LOGS, check_once, check_present, suffix_of
 from .source import UNDATED, Channel
 from .tables.dialect import DETECTED, QUALITY_WORD, TIME_NAME, TIME_NAMES, Dialect
 from .tables.order import Order, time_order
-from .tables.rows import TableRows, format_of, is_text, names_of, remarks_of, rows_of
-from .tables.text import NO_VALUE, UNREADABLE, TextMatch, csv_format, open_text
+from .tables.rows import TableRows, cells_of, format_of, names_of, remarks_of, rows_of
+from .tables.text import NO_VALUE, UNREADABLE, TextMatch, csv_format
 from .tables.times import CLOCK, DAY, SKIPPED, TWICE, TimeColumn, TimeReader
 from .units import heading_unit, suffix_unit
 
@@ -458,21 +458,14 @@ def _rows(
         faults.append(str(error))
 
 
-def _cells(path: Path, dialect: Dialect) -> Iterator[list[str]]:
-    """Yield the cells of the rows of a CSV."""
-    form = csv_format(path, dialect)
-    with open_text(path, form) as file:
-        yield from filter(form.fits, form.cells(file))
-
-
 def _time_of(path: Path, names: Sequence[str], time: TimeColumn, dialect: Dialect) -> str | None:
     """Return the time column, by its name or as the first one of dates."""
     last = {name.lower().rpartition(".")[2].partition("[")[0].strip(): name for name in reversed(names)}
     named = next((last[name] for name in TIME_NAMES if name in last), None)
     like = next((name for name in names if TIME_NAME.search(name)), None)
-    if named is not None or not is_text(path):
+    if named is not None or (cells := cells_of(path, dialect)) is None:
         return named or like
-    row = next(_cells(path, dialect), [])
+    row = next(cells, [])
     for pattern in (None, CLOCK):
         for name, cell in zip(names, map(str.strip, row), strict=False):
             if cell.replace(",", "").replace(".", "").lstrip("+-").isdigit():
@@ -484,8 +477,7 @@ def _time_of(path: Path, names: Sequence[str], time: TimeColumn, dialect: Dialec
 
 def _with_clock(path: Path, names: Sequence[str], time: TimeColumn, dialect: Dialect) -> TimeColumn:
     """Return the time column; both, if it is one of a CSV with dates in one column and clocks in another."""
-    first = islice(_cells(path, dialect), MAX_TEXTS) if is_text(path) else ()
-    rows = [[cell.strip() for cell in row] for row in first]
+    rows = [[cell.strip() for cell in row] for row in islice(cells_of(path, dialect) or (), MAX_TEXTS)]
     days, clocks = (
         [k for k in range(len(names)) if rows and all(pattern.fullmatch(row[k]) for row in rows)]
         for pattern in (DAY, CLOCK)
@@ -499,9 +491,9 @@ def _with_clock(path: Path, names: Sequence[str], time: TimeColumn, dialect: Dia
 def _texts(files: list[Path], names: list[str], dialect: Dialect) -> dict[str, Counter[str]]:
     found: dict[str, Counter[str]] = {name: Counter() for name in names}
     for path in files if names else ():
-        if is_text(path):
+        if (cells := cells_of(path, dialect)) is not None:
             places = [(counts, names_of(path, "", dialect).index(name)) for name, counts in found.items()]
-            for row in _cells(path, dialect):
+            for row in cells:
                 for counts, place in places:
                     text = row[place].strip()
                     if text and (text in counts or len(counts) < MAX_TEXTS):

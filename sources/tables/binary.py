@@ -38,7 +38,7 @@ MAX_COLUMNS = 1_000_000  # Columns of a NumPy archive, each of which has a name
 
 
 @contextmanager
-def _readable(path: Path, kind: str) -> Iterator[None]:
+def readable(path: Path, kind: str) -> Iterator[None]:
     """Turn the errors of a library that reads a damaged file into one line; they have no common base."""
     try:
         yield
@@ -48,7 +48,7 @@ def _readable(path: Path, kind: str) -> Iterator[None]:
         raise SourceError(f"{path}: it cannot be read as {kind} ({gist(error)}); check that it is complete") from None
 
 
-def _content(path: Path) -> Path | io.BytesIO:
+def content_of(path: Path) -> Path | io.BytesIO:
     """Return what a library that seeks can read: the path, or the decompressed bytes."""
     if not is_compressed(path):
         return path
@@ -72,13 +72,13 @@ def parquet_names(path: Path, time: str = "") -> list[str]:
     """Return the columns of a Parquet file; raises SourceError if it is none, or cut short."""
     import pyarrow.parquet
 
-    with _readable(path, "Parquet"):
-        return list(pyarrow.parquet.read_schema(_content(path)).names)
+    with readable(path, "Parquet"):
+        return list(pyarrow.parquet.read_schema(content_of(path)).names)
 
 
 def arrow_names(path: Path, time: str = "") -> list[str]:
     """Return the columns of an Arrow file or stream (Feather); raises SourceError if it is none, or cut short."""
-    with _readable(path, "Arrow"), _arrow(path) as reader:
+    with readable(path, "Arrow"), _arrow(path) as reader:
         return list(reader.schema.names)
 
 
@@ -86,7 +86,7 @@ def _arrow(path: Path) -> Any:
     """Open an Arrow file; a stream, if it does not end as one."""
     import pyarrow
 
-    source = pyarrow.PythonFile(content, "r") if isinstance(content := _content(path), io.BytesIO) else content
+    source = pyarrow.PythonFile(content, "r") if isinstance(content := content_of(path), io.BytesIO) else content
     try:
         return pyarrow.ipc.open_file(source)
     except pyarrow.ArrowInvalid:
@@ -98,7 +98,7 @@ def _arrow(path: Path) -> Any:
 def read_arrow(path: Path, time: str, columns: Sequence[Column], problem: Problem) -> Generator[Chunk, None, None]:
     """Yield the rows of an Arrow file or stream, as those of Parquet."""
     wanted = list(dict.fromkeys((time, *map(column_of, columns))))
-    with _readable(path, "Arrow"), _arrow(path) as reader:
+    with readable(path, "Arrow"), _arrow(path) as reader:
         count = getattr(reader, "num_record_batches", None)
         whole = reader if count is None else map(reader.get_batch, range(count))
         parts = (
@@ -112,7 +112,7 @@ def read_parquet(path: Path, time: str, columns: Sequence[Column], problem: Prob
     import pyarrow.parquet
 
     row = 0
-    with pyarrow.parquet.ParquetFile(_content(path)) as file:
+    with pyarrow.parquet.ParquetFile(content_of(path)) as file:
         wanted = list(dict.fromkeys((time, *map(column_of, columns))))
         for k in range(file.num_row_groups):
             group = file.metadata.row_group(k)
@@ -182,9 +182,9 @@ def mat_names(path: Path, time: str = "") -> list[str]:
 def _vectors(path: Path) -> dict[str, np.ndarray]:
     from scipy.io import loadmat
 
-    with _readable(path, "a MATLAB file"):
+    with readable(path, "a MATLAB file"):
         try:
-            content = loadmat(_content(path), squeeze_me=True, struct_as_record=False)
+            content = loadmat(content_of(path), squeeze_me=True, struct_as_record=False)
         except NotImplementedError:
             raise SourceError(f"{path}: it is MATLAB 7.3 (HDF5), which is not read; save it with -v7") from None
     found: dict[str, np.ndarray] = {}
@@ -216,7 +216,7 @@ def read_mat(path: Path, time: str, columns: Sequence[Column], problem: Problem)
                 f"{path}: {name} has {found[name].size} values and {time} has {found[time].size}; "
                 "take columns of one struct"
             )
-    yield from _chunks(
+    yield from chunks_of(
         found[time], {name: (found[name], [k], [0]) for k, name in enumerate(_numeric(path, columns))}, CHUNK_ROWS
     )
 
@@ -238,7 +238,7 @@ def npz_names(path: Path, time: str = "") -> list[str]:
 def _declared(path: Path) -> dict[str, tuple[tuple[int, ...], np.dtype]]:
     """Return shape and type of the arrays of numbers and dates in an archive, from their headers alone."""
     found = {}
-    with _readable(path, "a NumPy archive"), zipfile.ZipFile(_content(path)) as archive:
+    with readable(path, "a NumPy archive"), zipfile.ZipFile(content_of(path)) as archive:
         for item in archive.namelist():
             with archive.open(item) as file:
                 old = np.lib.format.read_magic(file) == (1, 0)
@@ -265,13 +265,13 @@ def read_npz(path: Path, time: str, columns: Sequence[Column], problem: Problem)
         places.append(k)
         cells.append(int(np.ravel_multi_index(cell, shape[1:])) if cell else 0)
     _check_size(path, sum(math.prod(declared[name][0]) * declared[name][1].itemsize for name in {time, *picks}))
-    with _readable(path, "a NumPy archive"), np.load(_content(path), allow_pickle=False) as archive:
+    with readable(path, "a NumPy archive"), np.load(content_of(path), allow_pickle=False) as archive:
         found = {name: archive[name] for name in {time, *picks}}
     arrays = {name: (found[name], places, cells) for name, (places, cells) in picks.items()}
-    yield from _chunks(found[time], arrays, max(1, CHUNK_VALUES // max(1, len(columns))))
+    yield from chunks_of(found[time], arrays, max(1, CHUNK_VALUES // max(1, len(columns))))
 
 
-def _chunks(
+def chunks_of(
     t: np.ndarray, arrays: dict[str, tuple[np.ndarray, list[int], list[int]]], step: int
 ) -> Generator[Chunk, None, None]:
     """Yield `step` rows at a time of arrays, each with the columns that it fills and the cells of a row to take."""

@@ -6,6 +6,7 @@ Text is read in this process; other formats in a process of their own, since the
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Sequence
+from itertools import chain
 from pathlib import Path
 from typing import NamedTuple
 
@@ -18,7 +19,7 @@ from ..source import UNDATED
 from ..worker_process import IsolatedReader, read_isolated
 from .binary import arrow_names, mat_names, npz_names, parquet_names, read_arrow, read_mat, read_npz, read_parquet
 from .dialect import DETECTED, Dialect
-from .text import Chunk, Column, csv_format, read_csv
+from .text import Chunk, Column, csv_format, csv_rows, read_csv
 from .times import TimeColumn, TimeReader
 
 _Names = Callable[..., list[str]]
@@ -28,14 +29,16 @@ _Read = Callable[..., Iterator[Chunk]]
 class TableFormat(NamedTuple):
     """How a table that is no CSV is read, in a process of its own; its functions are importable by name.
 
-    `names(path, time)`, `read(path, time, columns, problem)`. Rows of a `sparse` one have only some of the columns. Of
-    one whose cells are `text`, the functions take a `Dialect` as the last argument, and `read` the names of the time.
+    `names(path, time)`, `read(path, time, columns, problem)`. Rows of a `sparse` one have only some of the columns.
+    With `dialect`, the functions take a `Dialect` as the last argument. One whose `cells` are text, as lists of rows by
+    `cells(path, dialect)`, may have two columns of time: `read` takes the names of the time.
     """
 
     names: _Names
     read: _Read
     sparse: bool = False
-    text: bool = False
+    dialect: bool = False
+    cells: Callable[..., Iterator[list[list[str]]]] | None = None
 
 
 _FORMATS = {
@@ -85,6 +88,14 @@ def format_of(path: Path) -> TableFormat | None:
 def is_text(path: Path) -> bool:
     """Return whether a table is read as a CSV, whose reader cannot crash."""
     return format_of(path) is None
+
+
+def cells_of(path: Path, dialect: Dialect = DETECTED) -> Iterator[list[str]] | None:
+    """Return the cells of the rows of a table of text; None of any other one."""
+    form = format_of(path)
+    if form is None:
+        return csv_rows(path, dialect)
+    return None if form.cells is None else chain.from_iterable(read_isolated(form.cells, path, dialect))
 
 
 def names_of(path: Path, time: str = "", dialect: Dialect = DETECTED) -> list[str]:
@@ -157,11 +168,11 @@ def read_rows(
         problems.clear()
         return found
 
-    text = form is None or form.text
+    text = form is None or form.cells is not None
     if time.clock is not None and not text:
-        raise SourceError(f"{path}: {time.label} are two columns, which only a CSV may have; give one column of times")
+        raise SourceError(f"{path}: {time.label} are two columns, which only text may have; give one column of times")
     read = read_csv if form is None else form.read
-    more = (dialect,) if text else ()
+    more = (dialect,) if form is None or form.dialect else ()
     times = TimeReader(time, path)
     for chunk in read(path, time.names if text else time.name, columns, lambda *one: problems.append(one), *more):
         yield dated(chunk, times, time, problems)._replace(problems=taken())
@@ -191,4 +202,4 @@ def _undated(time: TimeColumn, cell: object) -> str:
 
 
 def _names(path: Path, time: str, form: TableFormat, dialect: Dialect) -> Iterator[list[str]]:
-    yield form.names(path, time, dialect) if form.text else form.names(path, time)
+    yield form.names(path, time, dialect) if form.dialect else form.names(path, time)

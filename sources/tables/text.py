@@ -64,11 +64,22 @@ class Chunk(NamedTuple):
 
 
 def open_text(path: Path, kind: CsvFormat) -> TextIO:
-    """Open a CSV after its heading; bytes that are not of its encoding are replaced."""
-    file = io.TextIOWrapper(open_binary(path), encoding=kind.encoding, errors="replace", newline="")
+    """Open a CSV; bytes that are not of its encoding are replaced."""
+    return io.TextIOWrapper(open_binary(path), encoding=kind.encoding, errors="replace", newline="")
+
+
+def after_heading(file: TextIO, kind: CsvFormat) -> TextIO:
+    """Return an open CSV after its heading."""
     for _ in range(kind.first - 1):
         file.readline(MAX_LINE_LENGTH)
     return file
+
+
+def csv_rows(path: Path, given: Dialect = DETECTED) -> Iterator[list[str]]:
+    """Yield the cells of the rows of a CSV."""
+    kind = csv_format(path, given)
+    with open_text(path, kind) as file:
+        yield from filter(kind.fits, kind.cells(after_heading(file, kind)))
 
 
 def csv_format(path: Path, given: Dialect = DETECTED) -> CsvFormat:
@@ -92,7 +103,7 @@ def has_rows(path: Path, given: Dialect = DETECTED) -> bool:
     with suppress(OSError):
         kind = csv_format(path, given)
         with open_text(path, kind) as file:
-            return kind.settled or any(line.strip() for line in file)
+            return kind.settled or any(line.strip() for line in after_heading(file, kind))
     return True  # What is wrong with the file is reported when its rows are read.
 
 
@@ -101,39 +112,46 @@ def read_csv(
 ) -> Iterator[Chunk]:
     """Yield the rows of a CSV; a value that is not a number is missing and reported, as is a row cut short."""
     kind = csv_format(path, given)
+    with open_text(path, kind) as file:
+        yield from read_text(file, kind, time, columns, problem)
+
+
+def read_text(
+    file: TextIO, kind: CsvFormat, time: Sequence[str], columns: Sequence[Column], problem: Problem
+) -> Iterator[Chunk]:
+    """Yield the rows of a CSV, see `read_csv`."""
     width, before = len(kind.names), kind.first - 1
     broken: tuple[int, list[str]] | None = None
     raw: list[str] = []
-    with open_text(path, kind) as file:
-        reader = kind.cells(_lines(file, raw))
-        ended = False
-        while not ended:
-            rows: list[list[str]] = []
-            lines: list[int] = []
-            while len(rows) < CHUNK_ROWS and not ended:
-                raw.clear()
-                fault = ""
-                try:
-                    row = next(reader, None)
-                except (csv.Error, OSError) as error:
-                    row, fault = None, f"{error}; the rest is left out"
-                if len(raw) > 1 and sum(line.count('"') for line in raw) % 2:
-                    # Quotes come in pairs, so this one took all that follows for one cell.
-                    after = "all after it" if fault else f"the {len(raw) - 1} after it"
-                    row, fault = None, f"a quote is opened and not closed; this line and {after} are left out"
-                if fault:
-                    problem(TRUNCATED, before + reader.line_num - len(raw) + 1, fault)
-                if row is None:
-                    ended = True
-                elif row:
-                    if broken is not None:
-                        problem(UNREADABLE, broken[0], f"has {len(broken[1])} cells, not {width}; the row is left out")
-                    broken = None if len(row) == width or kind.fits(row) else (before + reader.line_num, row)
-                    if broken is None:
-                        rows.append(row)
-                        lines.append(before + reader.line_num)
-            if rows:
-                yield chunk_of(rows, lines, kind, time, columns, problem)
+    reader = kind.cells(_lines(after_heading(file, kind), raw))
+    ended = False
+    while not ended:
+        rows: list[list[str]] = []
+        lines: list[int] = []
+        while len(rows) < CHUNK_ROWS and not ended:
+            raw.clear()
+            fault = ""
+            try:
+                row = next(reader, None)
+            except (csv.Error, OSError) as error:
+                row, fault = None, f"{error}; the rest is left out"
+            if len(raw) > 1 and sum(line.count('"') for line in raw) % 2:
+                # Quotes come in pairs, so this one took all that follows for one cell.
+                after = "all after it" if fault else f"the {len(raw) - 1} after it"
+                row, fault = None, f"a quote is opened and not closed; this line and {after} are left out"
+            if fault:
+                problem(TRUNCATED, before + reader.line_num - len(raw) + 1, fault)
+            if row is None:
+                ended = True
+            elif row:
+                if broken is not None:
+                    problem(UNREADABLE, broken[0], f"has {len(broken[1])} cells, not {width}; the row is left out")
+                broken = None if len(row) == width or kind.fits(row) else (before + reader.line_num, row)
+                if broken is None:
+                    rows.append(row)
+                    lines.append(before + reader.line_num)
+        if rows:
+            yield chunk_of(rows, lines, kind, time, columns, problem)
     if broken is not None:
         footer = len(broken[1]) == 1 and not any(map(str.isdigit, broken[1][0]))
         text = f"is {quoted(broken[1][0].strip())}, which is no row of the table; it is left out"

@@ -13,7 +13,7 @@ from config.yaml_files import ValuePlaces, shown_path
 from estimators.errors import ConfigError, SourceError, is_blank, nearest, quoted
 from estimators.fleet.tunings import GROUPS, out_of_range
 from estimators.tuning import Tuning
-from sources.tables.text import csv_format, open_text
+from sources.tables.text import after_heading, csv_format, open_text
 from sources.units import conversion, heading_unit
 
 from .schema import AssetTuningsSection
@@ -107,7 +107,9 @@ def _read(file: Path, asset_column: str, tuning: Tuning) -> Cells:
     try:
         form = csv_format(file)
         with open_text(file, form) as text:
-            rows = [(line, row) for line, row in enumerate(form.cells(text), form.first) if any(row)]
+            rows = [
+                (line, row) for line, row in enumerate(form.cells(after_heading(text, form)), form.first) if any(row)
+            ]
     except (OSError, SourceError, csv.Error) as error:
         raise ConfigError(f"{shown}: cannot be read: {error}") from None
     heads = form.names
