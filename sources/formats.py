@@ -2,13 +2,12 @@
 
 from __future__ import annotations
 
-import io
 import os
 import zipfile
 import zlib
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
-from typing import IO, Any, BinaryIO, Literal
+from typing import BinaryIO, Literal, cast
 
 from estimators.errors import SourceError
 
@@ -174,35 +173,15 @@ def refuse_others(path: Path, head: bytes) -> None:
         raise SourceError(f"{path}: is no table; it is YAML, as of a twin, whose recording nisus fold reads")
 
 
-_DAMAGED = (zipfile.BadZipFile, zlib.error, EOFError, NotImplementedError, RuntimeError)  # also: it has a password
-
-
-class _Member(io.RawIOBase):
-    """File in a ZIP archive, whose damage is an OSError, as that of other compressed files is."""
-
-    def __init__(self, file: IO[bytes]) -> None:
-        self._file = file
-
-    def readable(self) -> bool:
-        return True
-
-    def readinto(self, buffer: Any) -> int:
-        try:
-            data = self._file.read(len(buffer))
-        except _DAMAGED as error:
-            raise OSError(str(error)) from None
-        buffer[: len(data)] = data
-        return len(data)
+UNREADABLE_ERRORS = (OSError, zipfile.BadZipFile, zlib.error, EOFError, NotImplementedError, RuntimeError)
+"""Errors of `open_binary` and of reading such a file: it is damaged, or in an archive with a password."""
 
 
 def open_binary(path: Path) -> BinaryIO:
     """Open a file for reading; a compressed one is decompressed while it is read, and cannot be seeked."""
     if (archive := archive_of(path)) is not None:
-        try:
-            with zipfile.ZipFile(archive) as file:
-                return io.BufferedReader(_Member(file.open(path.relative_to(archive).as_posix())))
-        except (*_DAMAGED, KeyError) as error:
-            raise OSError(str(error)) from None
+        with zipfile.ZipFile(archive) as file:
+            return cast(BinaryIO, file.open(path.relative_to(archive).as_posix()))
     if not is_compressed(path):
         return path.open("rb")
     import pyarrow  # Here, not above: it takes long, and most files are not compressed.

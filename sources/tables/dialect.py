@@ -105,7 +105,7 @@ class CsvFormat(NamedTuple):
 
     def cells(self, lines: Iterable[str]) -> csv.Reader:  # type: ignore[name-defined]
         """Return a reader of the cells of lines."""
-        kept = (("\n" if line.startswith(self.comment) else line) for line in lines) if self.comment else lines
+        kept = (("\n" if _COMMENT.match(line) else line) for line in lines) if self.comment else lines
         return _reader(kept, self.delimiter)
 
     def fits(self, cells: Sequence[str]) -> bool:
@@ -309,7 +309,7 @@ class _Table:
         )
 
 
-_COMMENT = re.compile(r"(#|%|//)(?![,;\t|]) *")
+_COMMENT = re.compile(r"(#(?![\d,;\t|])|%(?= )|//(?= )) *")  # A name may be #1 or %RH.
 _SPACES = " '’\u00a0\u202f"  # Signs between thousands beside point and comma
 _EXPONENT = r"(?:[eE][+-]?\d+)?"
 _NUMBER = re.compile(
@@ -392,11 +392,12 @@ def _signs(path: Path, rows: Sequence[_Row], delimiter: str, given: str | None) 
         return any(map(pattern.fullmatch, among))
 
     lone = next(filter(_LONE.fullmatch, cells), None)
-    mixed = (_POINT, _WHOLE)[: 1 + (delimiter == ",")]
-    commas = some(_COMMAS) or (
-        lone is not None and any(some(_LONE, column) and any(some(one, column) for one in mixed) for column in columns)
-    )
+    mixed = [column for column in columns if some(_LONE, column)] if lone else []
+    quoted_cells = delimiter == ","  # Beside numbers with a point, such a comma is no decimal sign.
+    commas = some(_COMMAS) or any(some(_POINT, column) or (quoted_cells and some(_WHOLE, column)) for column in mixed)
     sure = any(_COMMA.fullmatch(cell) and not _LONE.fullmatch(cell) for cell in cells)
+    if quoted_cells and some(_POINT):
+        commas, sure = commas or lone is not None, False
     if given is None and lone and delimiter == "," and not (commas or sure or some(_DOTTED_DATE, cells)):
         line = next(row.line for row in rows if lone in row.cells)
         both = f"{lone.replace(',', '')} or {lone.replace(',', '.')}"

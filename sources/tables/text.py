@@ -14,7 +14,7 @@ import numpy as np
 
 from estimators.errors import SourceError, quoted
 
-from ..formats import open_binary
+from ..formats import UNREADABLE_ERRORS, open_binary
 from ..source import TRUNCATED
 from .dialect import DETECTED, HEAD_BYTES, QUALITY_WORD, CsvFormat, Dialect, format_of
 
@@ -94,13 +94,14 @@ def csv_format(path: Path, given: Dialect = DETECTED) -> CsvFormat:
             if not found.settled and len(head) == HEAD_BYTES:
                 found = format_of(path, head + binary.read(MAX_PREAMBLE_BYTES), given)
             return found
-    except OSError as error:
-        raise SourceError(f"{path}: it cannot be read ({error.strerror or error}); check that it is complete") from None
+    except UNREADABLE_ERRORS as error:
+        why = getattr(error, "strerror", None) or error
+        raise SourceError(f"{path}: it cannot be read ({why}); check that it is complete") from None
 
 
 def has_rows(path: Path, given: Dialect = DETECTED) -> bool:
     """Return whether anything follows the heading of a CSV."""
-    with suppress(OSError):
+    with suppress(*UNREADABLE_ERRORS):
         kind = csv_format(path, given)
         with open_text(path, kind) as file:
             return kind.settled or any(line.strip() for line in after_heading(file, kind))
@@ -133,7 +134,7 @@ def read_text(
             fault = ""
             try:
                 row = next(reader, None)
-            except (csv.Error, OSError) as error:
+            except (csv.Error, *UNREADABLE_ERRORS) as error:
                 row, fault = None, f"{error}; the rest is left out"
             if len(raw) > 1 and sum(line.count('"') for line in raw) % 2:
                 # Quotes come in pairs, so this one took all that follows for one cell.

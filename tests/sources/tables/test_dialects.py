@@ -125,6 +125,35 @@ def test_the_sign_between_thousands_is_known_from_the_column(tmp_path, rows, exp
 
 
 @pytest.mark.parametrize(
+    ("text", "names"),
+    [
+        ("#1 T,#2 T\n" + "".join(f"{k},{k}.5\n" for k in range(9)), ("#1 T", "#2 T")),
+        ("%RH,t\n" + "".join(f"{k},{k}.5\n" for k in range(9)), ("%RH", "t")),
+        ("#,t,x\n" + "".join(f"{k},{k}.5,1\n" for k in range(9)), ("#", "t", "x")),
+        ("t,1,2,3\n" + "".join(f"{k},4,5,6\n" for k in range(9)), ("t", "1", "2", "3")),
+        ("t,x,list\n" + "".join(f"{k},{k}.5,1;2;3;4\n" for k in range(9)), ("t", "x", "list")),
+        ("t,t_s\n" + "".join(f"{k},{k}.5\n" for k in range(9)), ("t", "t_s")),
+    ],
+)
+def test_a_heading_in_line_1_stays_as_it_is(tmp_path, text, names):
+    path, reports = write(tmp_path, text), Reports()
+    assert tuple(names_of(path)) == names
+    assert read(path, TimeColumn(names[1]), names[:1], report=reports).t.size == 9 and not reports.counts
+
+
+def test_a_comma_in_a_note_is_no_decimal_sign(tmp_path):
+    rows = "".join(f'{k}.5,{k}.25,"{k},5"\n' for k in range(9))
+    events = read(write(tmp_path, "t,x,note\n" + rows), TimeColumn("t"), ["x"])
+    assert events.value[:, 0].tolist() == [k + 0.25 for k in range(9)]
+
+
+def test_names_of_sensors_that_begin_with_a_number_sign_are_no_comments(tmp_path):
+    rows = "".join(f"#{1 + k % 2},{k},{k}.5\n" for k in range(9))
+    events = read(write(tmp_path, "# exported\nid,t,x\n" + rows), TimeColumn("t"), ["x"])
+    assert events.value[:, 0].tolist() == [k + 0.5 for k in range(9)]
+
+
+@pytest.mark.parametrize(
     ("options", "expected"),
     [
         ({"heading": "x"}, "--heading x: is no line; give its number from 1 on, or none"),
