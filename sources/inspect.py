@@ -289,7 +289,7 @@ def _tables(files: list[Path], time: TimeColumn, dialect: Dialect) -> RecordingC
     if len(names) < 2:
         raise SourceError(
             f"{files[0]}: has one column, {quoted(names[0] if names else '')}; a table has a header, a column of times "
-            "and one of values"
+            "and one of values: if it has, give --delimiter, or --skip for lines before it"
         )
     if chosen is None:
         raise SourceError(

@@ -8,6 +8,7 @@ import pyarrow.feather
 import pytest
 
 from app.cli.main import main
+from app.study.log_overview import overview
 from estimators.errors import SourceError
 from estimators.log import READING
 from sources.formats import files_of, is_recording
@@ -68,6 +69,11 @@ def test_a_folder_is_named_on_the_command_line(days, monkeypatch, capsys):
     monkeypatch.chdir(days.parent)
     assert main(["log", days.name]) == 0
     assert "2024-03-01.csv and 2 more: 150 rows" in capsys.readouterr().out
+
+
+def test_an_archive_that_is_dropped_on_the_page_is_its_files(days):
+    *_, last = overview(days, None, [], None)
+    assert [(one.name, one.number) for one in last.signals] == [("w", 150)] and last.time == "t"
 
 
 def test_what_is_no_one_recording_is_refused_with_a_choice(tmp_path):
