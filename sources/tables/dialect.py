@@ -152,8 +152,8 @@ def format_of(path: Path, head: bytes, given: Dialect = DETECTED) -> CsvFormat:
         lines.pop()  # It is cut.
     if separator := re.fullmatch(r'"?sep=(.)"?\s*', lines[0] if lines else "", re.IGNORECASE):
         given = given._replace(delimiter=given.delimiter or separator[1], skip=max(given.skip, 1))
-    if given.heading and given.heading > len(lines):
-        raise SourceError(f"{path}: its heading is to be line {given.heading}, and it has {len(lines)}; correct it")
+    if given.heading and not "".join(lines[given.heading - 1 : given.heading]).strip(f"\r\n{DELIMITERS}"):
+        raise SourceError(f"{path}: its heading is to be line {given.heading}, which is blank or not there; correct it")
     first = lines[given.skip] if given.skip < len(lines) else ""
     offered = sorted(DELIMITERS[:-1], key=first.count, reverse=True)
     tables = [_Table(lines, delimiter, given) for delimiter in (given.delimiter or [*offered, " "])]
@@ -247,7 +247,7 @@ class _Table:
         before, given = self._all[: self._begin], self._given.heading
         if given is not None:
             block = [row for row in before if row.line >= given and (row.line == given or self._is_text(row))]
-            return (block[0], block) if given and block else (None, [])
+            return (block[0], block) if given and block and block[0].cells else (None, [])
         named = [k for k, row in enumerate(before) if self._is_text(row) or (self._fits(row) and _timed(row) == 2)]
         named = [k for k in named if not before[k].comment] or named[-1:]
         if named:
@@ -292,7 +292,7 @@ class _Table:
         else:
             width = self._width - self._ragged
             names, first = [f"c{k}" for k in range(1, width + 1)], rows[0].line
-            if given.heading is None:
+            if given.heading != 0:
                 remarks.append(f"no heading, so columns are named c1 to c{width}")
         decimal, group = _signs(path, rows, self.delimiter, given.decimal)
         comment = next((m[1] for line in self._lines[given.skip :] if (m := _COMMENT.match(line))), "")
@@ -332,7 +332,7 @@ def _is_typed(cell: str) -> bool:
 
 
 def _is_neutral(cell: str) -> bool:
-    """Return whether a cell says that there is no value."""
+    """Return whether a cell is blank or a word for a missing value."""
     return cell.lower() in ("", "na", "n/a", "null", "none", "-") or QUALITY_WORD.fullmatch(cell) is not None
 
 

@@ -1,7 +1,6 @@
 """Dialects of tables: names, values and the remark of each, against the numbers written and against pandas."""
 
 import io
-from pathlib import Path
 
 import numpy as np
 import pandas as pd
@@ -17,7 +16,7 @@ from sources.tables.table import Table
 from sources.tables.text import READ_AS
 from sources.tables.times import TimeColumn
 from tests.sources.can.can_tools import Reports
-from tests.sources.tables.dialects import FLOW, HEAD, LOGGER, NAMES, SAMPLES, SEMI, VALUES, N, T, body
+from tests.sources.tables.dialects import FLOW, HEAD, LOGGER, NAMES, REPORTED, SAMPLES, SEMI, VALUES, N, T, body
 from tests.support import error_of, read_all
 
 
@@ -50,19 +49,12 @@ def test_a_dialect_is_read_as_it_was_written_and_told(tmp_path, name):
     assert reports.texts.get(READ_AS, "drive.csv: ") == f"drive.csv: {sample.remark}"
 
 
-@pytest.mark.parametrize("name", ["a_sep", "b_section", "e_trailing", "h_headcommas", "m_quotedcomma"])
-def test_a_reported_file_is_read_as_pandas_reads_it_when_it_is_told_how(name):
-    path = Path("/work/shared/cases/dialects", f"{name}.csv")
-    if not path.exists():
-        pytest.skip("the reported files are not here")
-    told = {
-        "a_sep": {"sep": ";", "decimal": ",", "skiprows": 1, "encoding": "cp1252"},
-        "b_section": {"skiprows": 1},
-        "e_trailing": {"index_col": False},
-        "h_headcommas": {"sep": ";", "decimal": ","},
-        "m_quotedcomma": {"decimal": ","},
-    }
-    frame = pd.read_csv(path, **told[name])
+@pytest.mark.parametrize("name", REPORTED)
+def test_a_reported_file_is_read_as_pandas_reads_it_when_it_is_told_how(tmp_path, name):
+    text, told = REPORTED[name]
+    path = tmp_path / "reported.csv"
+    path.write_bytes(text.encode("cp1252"))
+    frame = pd.read_csv(io.StringIO(text), **told)
     names = names_of(path)
     assert [one.partition(" [")[0] for one in names] == [one.partition(" [")[0] for one in frame.columns]
     columns = [names[k] for k in range(1, len(names)) if frame.dtypes.iloc[k] == np.float64]
@@ -167,10 +159,11 @@ def test_a_wrong_key_is_one_line(options, expected):
     assert error_of(SourceError, dialect_of, **options, sign="--") == expected
 
 
-def test_a_heading_behind_the_end_is_refused(tmp_path):
-    path = write(tmp_path, HEAD + body())
-    text = error_of(SourceError, names_of, path, "", Dialect(heading=99))
-    assert text == f"{path}: its heading is to be line 99, and it has 41; correct it"
+@pytest.mark.parametrize("line", [2, 99])
+def test_a_heading_that_is_blank_or_behind_the_end_is_refused(tmp_path, line):
+    path = write(tmp_path, HEAD + ",,\n" + body())
+    text = error_of(SourceError, names_of, path, "", Dialect(heading=line))
+    assert text == f"{path}: its heading is to be line {line}, which is blank or not there; correct it"
 
 
 def test_a_summary_names_the_units_and_the_dialect(tmp_path):
