@@ -192,7 +192,8 @@ class RecordingSection(Section):
     """Folder of the recordings, relative to this YAML. The environment variable NISUS_DATA replaces it. If there is no
     such folder and `get` is given, the user's cache does. Default: null, `files` are relative to this YAML."""
     files: Texts
-    """The recording's files in their order; * and ? match. `--log FILE...` replaces them."""
+    """The recording's files in their order; * and ? match. A folder or ZIP archive is all recordings in it, by name.
+    `--log FILE...` replaces them."""
     get: Text | None = None
     """Where to get the recording, shown when it is absent."""
 
@@ -245,7 +246,7 @@ class TimeColumnSection(Section):
 
 
 class TableSection(RecordingSection):
-    """A table: CSV, Parquet, MATLAB (.mat up to version 7) or NumPy (.npz); compressed if it ends in .gz, .bz2 or .zst.
+    """A table: CSV, Parquet, Arrow (.feather), MATLAB (.mat up to version 7) or NumPy (.npz), or one of these as .gz.
 
     Columns of a MATLAB file are its vectors by their names there: meas.Voltage. Those of a NumPy archive are its arrays
     whose first axis is time: speed, or t2m_K[3,5] for a cell of a field. Those of a ROS 2 bag (.mcap, .db3, or the
@@ -263,6 +264,17 @@ class TableSection(RecordingSection):
     follow: Annotated[bool, Field(strict=True)] = False
     """Whether the files are CSV that grow, or appear in the folders that `files` names, while the twin runs: each row
     is read once, files in the order of their names. Default: false."""
+    heading: Annotated[int, Field(strict=True, ge=1)] | Literal["none"] | None = None
+    """Line of a CSV, or row of a sheet, with the names of the columns; none if there is none, and they are c1, c2, ...
+    Default: null, detected."""
+    delimiter: Text | None = None
+    """Sign between the cells of a CSV; tab and space are words. Default: null, detected."""
+    decimal: Literal[".", ","] | None = None
+    """Decimal sign of a CSV; the other one separates thousands. Default: null, detected."""
+    skip: Annotated[int, Field(strict=True, ge=0)] = 0
+    """Lines before the table, which are left out; a heading is detected after them. Default: 0."""
+    sheet: Text | None = None
+    """Sheet of a workbook, or group of channels of a TDMS file. Default: null, the only one with a table."""
     truth: dict[str, ColumnSection] = {}
     """States whose true value the table holds. They are scored, never used. Of a field under its name: the array
     with a cell for each of its own; cells that a sensor reads are left out."""

@@ -3,9 +3,11 @@
 from __future__ import annotations
 
 import os
+import zipfile
+import zlib
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
-from typing import BinaryIO, Literal
+from typing import BinaryIO, Literal, cast
 
 from estimators.errors import SourceError
 
@@ -13,12 +15,16 @@ CAN_LOGS = (".asc", ".blf", ".csv", ".db", ".log", ".mf4", ".trc")  # Endings of
 
 EITHER = (".csv", ".txt")  # Endings of CAN logs and of tables, which their content tells apart
 
-TABLES = (".csv", ".parquet", ".pq", ".mat", ".npz", ".mf4", ".mdf", ".dat")
+TABLES = (".csv", ".parquet", ".pq", ".feather", ".arrow", ".mat", ".npz", ".mf4", ".mdf", ".dat")
 
 MDF = (".mf4", ".mdf", ".dat")  # Endings of ASAM MDF, which holds signals or frames of CAN
 
-EXTRAS = {".mcap": "robotics", ".db3": "robotics"}
+EXTRAS = {
+    ".mcap": "robotics", ".db3": "robotics", ".xlsx": "excel", ".xls": "excel", ".ods": "excel", ".tdms": "tdms",
+}  # fmt: skip
 """Endings of tables that a bundled extension reads, which is named where it is missing."""
+
+ZIP = ".zip"
 
 COMPRESSIONS = (".gz", ".bz2", ".lz4", ".zst")
 """Endings of compressed files, after that of the format. Of CAN logs, python-can reads `.gz` only."""
@@ -45,25 +51,67 @@ def suffix_of(path: Path) -> str:
 
 
 def is_compressed(path: Path) -> bool:
-    """Return whether the file as a whole is compressed, by its ending."""
-    return path.suffix.lower() in COMPRESSIONS
+    """Return whether the file as a whole is compressed, by its ending, or as a part of a ZIP archive."""
+    return path.suffix.lower() in COMPRESSIONS or archive_of(path) is not None
+
+
+def archive_of(path: Path) -> Path | None:
+    """Return the ZIP archive in which a file is, as `export.zip/drive.csv`; None of any other file."""
+    zips = (folder for folder in path.parents if folder.suffix.lower() == ZIP)
+    return next((folder for folder in zips if folder.is_file()), None)
+
+
+def is_file(path: Path) -> bool:
+    """Return whether there is such a file, in a folder or a ZIP archive."""
+    archive = archive_of(path)
+    return path.is_file() if archive is None else path in _members(archive)
+
+
+def _members(archive: Path) -> list[Path]:
+    """Return the files in a ZIP archive.
+
+    Raises:
+        SourceError: If it cannot be read.
+    """
+    try:
+        with zipfile.ZipFile(archive) as file:
+            return sorted(archive / name for name in file.namelist() if not name.endswith("/"))
+    except (OSError, zipfile.BadZipFile) as error:
+        raise SourceError(f"{archive}: it cannot be read as ZIP ({error}); check that it is complete") from None
 
 
 def is_recording(name: str) -> bool:
     """Return whether a file of this name can replace a twin's own recording."""
-    return suffix_of(Path(name)) in {*CAN_LOGS, *tables()}
+    return suffix_of(Path(name)) in {*CAN_LOGS, *tables(), ZIP}
 
 
 def files_of(path: Path) -> list[Path]:
-    """Return the recordings of a folder that is one recording, in their order; any other path as it is.
+    """Return the recordings in a folder or a ZIP archive, in their order; any other path as it is.
+
+    A folder that is one recording names its files; of any other one they are all recordings of the one format in it, by
+    name.
 
     Raises:
-        SourceError: If the folder does not name its recordings, or they cannot be read.
+        SourceError: If there are none, or of several formats, or they cannot be read.
     """
     for name, files in added("folders").items() if path.is_dir() else ():
         if (path / name).is_file():
             return list(files()(path))
-    return [path]
+    if path.is_dir():
+        inside = sorted(one for one in path.iterdir() if one.is_file())
+    elif path.suffix.lower() == ZIP and path.is_file():
+        inside = _members(path)
+    else:
+        return [path]
+    found = [one for one in inside if is_recording(one.name) and one.name[0] not in "._"]
+    kinds = sorted({suffix_of(one) for one in found})
+    if not found:
+        endings = ", ".join(dict.fromkeys((*TABLES, *CAN_LOGS)))
+        raise SourceError(f"{path}: holds no recording; name a file that ends in {endings}")
+    if len(kinds) > 1:
+        choice = f"{path}/*{kinds[0]}" if path.is_dir() else f"{found[0]}"
+        raise SourceError(f"{path}: holds recordings of several formats ({', '.join(kinds)}); name some: {choice}")
+    return [file for one in found for file in (files_of(one) if kinds == [ZIP] else [one])]
 
 
 def is_whole(folder: Path) -> bool:
@@ -90,14 +138,17 @@ def check_present(path: Path) -> None:
     Raises:
         SourceError: Naming it.
     """
-    if not path.is_file():
+    if not is_file(path):
         raise SourceError(f"{path}: there is no such file; check the path of the recording")
-    if path.stat().st_size == 0:
+    if archive_of(path) is None and path.stat().st_size == 0:
         raise SourceError(f"{path}: the file is empty; record it again")
 
 
 BEGINNINGS = {
-    b"PK\x03\x04": "an Excel workbook or a ZIP archive; export the sheet as CSV",
+    b"PK\x03\x04": "an Excel workbook or a ZIP archive; let its name end in .xlsx or .zip",
+    b"\xd0\xcf\x11\xe0": "an old Excel workbook; let its name end in .xls",
+    b"TDSm": "TDMS; let its name end in .tdms",
+    b"ARROW1": "Arrow; let its name end in .arrow",
     b"\x89HDF": "HDF5; export it as Parquet or CSV",
     b"%PDF": "a PDF; give a CSV",
     b"RRF": "a recording of Nisus; nisus review opens it",
@@ -126,8 +177,15 @@ def refuse_others(path: Path, head: bytes) -> None:
         raise SourceError(f"{path}: is no table; it is YAML, as of a twin, whose recording nisus fold reads")
 
 
+UNREADABLE_ERRORS = (OSError, zipfile.BadZipFile, zlib.error, EOFError, NotImplementedError, RuntimeError)
+"""Errors of `open_binary` and of reading such a file: it is damaged, or in an archive with a password."""
+
+
 def open_binary(path: Path) -> BinaryIO:
     """Open a file for reading; a compressed one is decompressed while it is read, and cannot be seeked."""
+    if (archive := archive_of(path)) is not None:
+        with zipfile.ZipFile(archive) as file:
+            return cast(BinaryIO, file.open(path.relative_to(archive).as_posix()))
     if not is_compressed(path):
         return path.open("rb")
     import pyarrow  # Here, not above: it takes long, and most files are not compressed.

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import csv
 import json
 import re
 from collections import Counter, defaultdict
@@ -26,10 +25,11 @@ from .can.transport import Transport
 from .formats import CAN_LOGS, EITHER, check_once, check_present, suffix_of
 from .source import UNDATED, Channel, ignore
 from .tables.dates import CLOCK, is_day
+from .tables.dialect import DETECTED, QUALITY_WORD, TIME_NAME, TIME_NAMES, Dialect
 from .tables.mdf import holds_signals
 from .tables.order import Order, time_order
-from .tables.rows import TableRows, format_of, is_text, names_of, rows_of
-from .tables.text import NO_VALUE, QUALITY_WORD, UNREADABLE, TextMatch, csv_format, open_text
+from .tables.rows import TableRows, cells_of, format_of, names_of, remarks_of, rows_of
+from .tables.text import NO_VALUE, UNREADABLE, TextMatch
 from .tables.times import EPOCH_S, SKIPPED, TWICE, TimeColumn, TimeReader
 from .units import heading_unit, suffix_unit
 
@@ -38,14 +38,6 @@ MAX_FRAME_BYTES = 64  # Bytes of the longest frame, of CAN FD
 MIN_GAP_S = 1.0
 MIN_GAP_INTERVALS = 20.0
 """Seconds, or median intervals if they are longer, from which on a pause is a gap."""
-
-TIME_NAMES = (
-    "t", "ts", "time", "timestamp", "seconds", "time_s", "t_s", "date", "datetime", "unix_time", "elapsed", "zeit",
-    "zeitstempel", "datum", "horodatage", "fecha",
-)  # fmt: skip
-"""Usual names of a time column; otherwise the first one of dates is taken, or the first that is named like one."""
-
-TIME_NAME = re.compile(r"^t[_ ]|time|epoch|zeit|datum", re.IGNORECASE)
 
 QUALITY = re.compile(r"qual|valid|güte", re.IGNORECASE)
 GOOD_WORD = re.compile(r"good\b.*|ok|valid|normal|gut", re.IGNORECASE)
@@ -118,6 +110,7 @@ class RecordingContents:
     texts: dict[str, Counter[str]] = field(default_factory=dict)
     faults: list[str] = field(default_factory=list)
     by: str = ""
+    dialect: Dialect = DETECTED
     parts: tuple[RecordingContents, ...] = ()
 
     @property
@@ -144,7 +137,10 @@ def is_table(path: Path) -> bool:
 
 
 def inspect_recordings(
-    files: Sequence[Path], databases: Sequence[tuple[Path, BusName]] = (), time: TimeColumn | None = None
+    files: Sequence[Path],
+    databases: Sequence[tuple[Path, BusName]] = (),
+    time: TimeColumn | None = None,
+    dialect: Dialect = DETECTED,
 ) -> RecordingContents:
     """Return the contents of recordings, CAN logs or tables.
 
@@ -152,6 +148,7 @@ def inspect_recordings(
         files: In their order.
         databases: DBC files with the bus that each describes, None for every one.
         time: Time column of a table; None, or an empty name, searches for one.
+        dialect: How a table is written, as far as it is not detected.
 
     Raises:
         SourceError: If a file cannot be read.
@@ -163,11 +160,12 @@ def inspect_recordings(
     check_once(files)
     groups: dict[tuple[str, ...], list[Path]] = {}
     for path in files:
-        groups.setdefault(("table", *sorted(set(names_of(path)))) if is_table(path) else ("log",), []).append(path)
+        kind = ("table", *sorted(set(names_of(path, "", dialect)))) if is_table(path) else ("log",)
+        groups.setdefault(kind, []).append(path)
     found = [
         _logs(group, list(databases), time.zone if time else None)
         if kind == "log"
-        else _tables(group, time or TimeColumn(""))
+        else _tables(group, time or TimeColumn(""), dialect)
         for (kind, *_), group in groups.items()
     ]
     return found[0] if len(found) == 1 else _merged(found)
@@ -319,32 +317,34 @@ def _series(name: str, unit: str, t: np.ndarray, values: np.ndarray) -> SignalSe
     return SignalSeries(name, unit, t[known], values[known], int(np.sum(~known)))
 
 
-def _tables(files: list[Path], time: TimeColumn) -> RecordingContents:
-    names = names_of(files[0])
-    chosen = time.name or _time_of(files[0], names, time)
+def _tables(files: list[Path], time: TimeColumn, dialect: Dialect) -> RecordingContents:
+    names = names_of(files[0], "", dialect)
+    chosen = time.name or _time_of(files[0], names, time, dialect)
     if time.name and time.name not in names:
         raise SourceError(f"--time {quoted(time.name)}: is no column of {files[0]}; {nearest(time.name, names)}")
     if len(names) < 2:
         raise SourceError(
             f"{files[0]}: has one column, {quoted(names[0] if names else '')}; a table has a header, a column of times "
-            "and one of values"
+            "and one of values: if it has, give --delimiter, or --skip for lines before it"
         )
     if chosen is None:
         raise SourceError(
             f"{files[0]}: which column holds the time is not known; name it with --time, one of {', '.join(names[:12])}"
         )
-    time = _with_clock(files[0], names, time._replace(name=chosen))
+    time = _with_clock(files[0], names, time._replace(name=chosen), dialect)
     chosen = time.name
     named = heading_unit(chosen) or chosen.rpartition("_")[2]
     if time.unit == "s" and named in ("ms", "us", "ns", "min", "h"):
         time = time._replace(unit=named)
-    faults: list[str] = []
+    faults = remarks_of(files, dialect)
     copies = [name for name, count in Counter(names).items() if count > 1]
     if chosen in copies:
         raise SourceError(f"{files[0]}: there are {names.count(chosen)} columns {chosen!r}; give each its own name")
     if copies:
         faults.append(f"several columns are named {', '.join(copies)} and are left out; give each its own name")
-    columns = [name for name in dict.fromkeys(names_of(files[0], chosen)) if name not in (*time.names, *copies)]
+    columns = [
+        name for name in dict.fromkeys(names_of(files[0], chosen, dialect)) if name not in (*time.names, *copies)
+    ]
     if other := [name for name in dict.fromkeys(names) if name not in (*time.names, *copies, *columns)]:
         shown = ", ".join(other[:3]) + (", ..." if len(other) > 3 else "")
         faults.append(
@@ -358,7 +358,7 @@ def _tables(files: list[Path], time: TimeColumn) -> RecordingContents:
     if form is not None and form.sparse:
         return _sparse(files, time, columns, order, faults)
     for path in files:
-        for rows in _rows(path, time, columns, faults, counted):
+        for rows in _rows(path, time, columns, faults, counted, dialect):
             time = time._replace(unit=rows.unit)
             times.append(rows.t[rows.known])
             values.append(rows.values[rows.known])
@@ -375,14 +375,15 @@ def _tables(files: list[Path], time: TimeColumn) -> RecordingContents:
         more = f"; so are {len(undated) - 1} more rows" if len(undated) > 1 else ""
         faults.append(undated[0] + more)
     t, v = np.concatenate(times), np.concatenate(values)
-    texts = _texts(files, [name for name, column in zip(columns, v.T, strict=True) if not np.isfinite(column).any()])
+    wordy = [name for name, column in zip(columns, v.T, strict=True) if not np.isfinite(column).any()]
+    texts = _texts(files, wordy, dialect)
     words = {key: key.removeprefix(NO_VALUE).partition(": ")[0] for key, rows in counted.items() if rows}
     faults += [
         f"{key} (rows: {len(counted[key])}, the first {counted[key][0]})"
         for key, name in words.items()
         if name not in texts
     ]
-    by, labels, source = _source_of(files, time, dict(zip(columns, v.T, strict=True)), texts, t)
+    by, labels, source = _source_of(files, time, dict(zip(columns, v.T, strict=True)), texts, t, dialect)
     order.report_late(time_order(t, source, HORIZON_NS) is not None)
     rank = np.argsort(t, kind="stable")
     t, v, source = t[rank], v[rank], source[rank]
@@ -394,7 +395,9 @@ def _tables(files: list[Path], time: TimeColumn) -> RecordingContents:
     low, high = (end * 10**9 for end in SERIAL_DATES)
     if time.unit == "s" and low <= t[0] and t[-1] <= high and t[-1] - t[0] < 0.5e9 * t.size:
         faults.append(f"column {chosen} looks like Excel's serial dates: add --time-unit excel")
-    return RecordingContents(files, "table", t, columns=found, time=time, faults=faults, texts=texts, by=by)
+    return RecordingContents(
+        files, "table", t, columns=found, time=time, faults=faults, texts=texts, by=by, dialect=dialect
+    )
 
 
 def _sparse(
@@ -422,7 +425,12 @@ def _sparse(
 
 
 def _source_of(
-    files: list[Path], time: TimeColumn, columns: dict[str, np.ndarray], texts: dict[str, Counter[str]], t: np.ndarray
+    files: list[Path],
+    time: TimeColumn,
+    columns: dict[str, np.ndarray],
+    texts: dict[str, Counter[str]],
+    t: np.ndarray,
+    dialect: Dialect,
 ) -> tuple[str, list[str], np.ndarray]:
     """Return the column that names the source of each row, the names, and the source of each row by its number.
 
@@ -445,8 +453,8 @@ def _source_of(
         if 1 < len(counts) < MAX_TEXTS and TAG.search(name):
             labels = sorted(counts)
             matches = [TextMatch(name, (label,)) for label in labels]
-            rows = [rows for path in files for rows in rows_of(path, time, matches, lambda: 1.0) if rows is not None]
-            found = np.concatenate([part.values[part.known] for part in rows])
+            parts = (part for path in files for part in rows_of(path, time, matches, lambda: 1.0, dialect))
+            found = np.concatenate([part.values[part.known] for part in parts if part is not None])
             if found.shape[0] == t.size and np.all(np.nansum(found, axis=1) == 1.0):
                 consider(name, labels, np.argmax(found, axis=1))
     return best
@@ -466,11 +474,16 @@ def _split(
 
 
 def _rows(
-    path: Path, time: TimeColumn, columns: list[str], faults: list[str], counted: dict[str, list[str]]
+    path: Path,
+    time: TimeColumn,
+    columns: list[str],
+    faults: list[str],
+    counted: dict[str, list[str]],
+    dialect: Dialect = DETECTED,
 ) -> Iterator[TableRows]:
     """Yield the rows of one table as far as it can be read; problems of a key in `counted` are added there."""
     try:
-        for rows in rows_of(path, time, columns, lambda: 1.0):
+        for rows in rows_of(path, time, columns, lambda: 1.0, dialect):
             if rows is not None:
                 for key, line, text in rows.problems:
                     if key.startswith(NO_VALUE):
@@ -482,23 +495,14 @@ def _rows(
         faults.append(str(error))
 
 
-def _cells(path: Path) -> Iterator[list[str]]:
-    """Yield the cells of the rows of a CSV."""
-    form = csv_format(path)
-    with open_text(path, form.encoding) as file:
-        for row in islice(csv.reader(file, delimiter=form.delimiter), 1, None):
-            if len(row) == len(form.names):
-                yield row
-
-
-def _time_of(path: Path, names: Sequence[str], time: TimeColumn) -> str | None:
+def _time_of(path: Path, names: Sequence[str], time: TimeColumn, dialect: Dialect) -> str | None:
     """Return the time column, by its name, as the first one of dates, or as the first that counts from 1970."""
     last = {name.lower().rpartition(".")[2].partition("[")[0].strip(): name for name in reversed(names)}
     named = next((last[name] for name in TIME_NAMES if name in last), None)
     like = next((name for name in names if TIME_NAME.search(name)), None)
-    if named is not None or not is_text(path):
+    if named is not None or (cells := cells_of(path, dialect)) is None:
         return named or like
-    row = next(_cells(path), [])
+    row = next(cells, [])
     for pattern in (None, CLOCK):
         for name, cell in zip(names, map(str.strip, row), strict=False):
             if cell.replace(",", "").replace(".", "").lstrip("+-").isdigit():
@@ -507,7 +511,7 @@ def _time_of(path: Path, names: Sequence[str], time: TimeColumn) -> str | None:
                 return name
     if like is not None:
         return like
-    rows = list(islice(_cells(path), MAX_TEXTS))
+    rows = [row, *islice(cells, MAX_TEXTS)]
     return next((name for k, name in enumerate(names) if _since_1970([cell[k] for cell in rows])), None)
 
 
@@ -522,9 +526,9 @@ def _since_1970(cells: list[str]) -> bool:
     return rising and bool(np.any((low <= numbers[0]) & (numbers[-1] <= high)))
 
 
-def _with_clock(path: Path, names: Sequence[str], time: TimeColumn) -> TimeColumn:
+def _with_clock(path: Path, names: Sequence[str], time: TimeColumn, dialect: Dialect) -> TimeColumn:
     """Return the time column; both, if it is one of a CSV with dates in one column and clocks in another."""
-    rows = [[cell.strip() for cell in row] for row in islice(_cells(path), MAX_TEXTS)] if is_text(path) else []
+    rows = [[cell.strip() for cell in row] for row in islice(cells_of(path, dialect) or (), MAX_TEXTS)]
     days, clocks = (
         [k for k in range(len(names)) if rows and all(is_one(row[k]) for row in rows)]
         for is_one in (is_day, CLOCK.fullmatch)
@@ -535,12 +539,12 @@ def _with_clock(path: Path, names: Sequence[str], time: TimeColumn) -> TimeColum
     return time._replace(name=names[days[0]], clock=time.name) if days and chosen in clocks else time
 
 
-def _texts(files: list[Path], names: list[str]) -> dict[str, Counter[str]]:
+def _texts(files: list[Path], names: list[str], dialect: Dialect) -> dict[str, Counter[str]]:
     found: dict[str, Counter[str]] = {name: Counter() for name in names}
     for path in files if names else ():
-        if is_text(path):
-            places = [(counts, names_of(path).index(name)) for name, counts in found.items()]
-            for row in _cells(path):
+        if (cells := cells_of(path, dialect)) is not None:
+            places = [(counts, names_of(path, "", dialect).index(name)) for name, counts in found.items()]
+            for row in cells:
                 for counts, place in places:
                     text = row[place].strip()
                     if text and (text in counts or len(counts) < MAX_TEXTS):

@@ -130,7 +130,15 @@ def _unit(text: str) -> pint.Unit:
         text = re.sub(r"\b(degC|degF)\b", r"delta_\1", text)
     try:
         return _registry().Unit(text)
-    except (pint.PintError, AttributeError, TypeError, ValueError, SyntaxError, AssertionError) as error:
+    except (
+        pint.PintError,
+        ArithmeticError,
+        AttributeError,
+        TypeError,
+        ValueError,
+        SyntaxError,
+        AssertionError,
+    ) as error:
         raise LookupError(text) from error
 
 

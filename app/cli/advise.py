@@ -10,7 +10,6 @@ from config.loader import moved, shipped
 from config.old_names import rewrite
 from estimators.errors import ConfigError
 from estimators.log import READING, Log
-from sources.formats import is_whole
 
 from ..format_time import counted
 from ..render.text import to_text
@@ -41,10 +40,7 @@ def advise(arguments: Arguments) -> int:
     Raises:
         ConfigError: If twins and recordings are mixed, or an option does not apply.
     """
-    whole = [what for what in arguments.what if what not in shipped() and is_whole(Path(what))]
-    for what in arguments.what:
-        if what not in (*shipped(), *whole) and Path(what).is_dir():
-            raise ConfigError(f"{what}: it is a folder; name a twin's YAML or recordings in it")
+    whole = [what for what in arguments.what if what not in shipped() and Path(what).is_dir()]
     twins = [what for what in arguments.what if what in shipped() or Path(what).suffix in (".yaml", ".yml")]
     if not twins and all(Path(what).suffix or what in whole for what in arguments.what):
         if arguments.apply or arguments.log or arguments.set or arguments.estimator:

@@ -110,6 +110,16 @@ class TableOptions:
     """Format of its dates, for example "%m/%d/%Y %H:%M:%S". Default: detected."""
     time_zone: str | None = None
     """Time zone of dates without an offset, for example Europe/Berlin. Default: UTC."""
+    heading: str | None = None
+    """Line with the names of the columns of a table, or none. Default: detected."""
+    delimiter: str | None = None
+    """Sign between its cells, or tab or space. Default: detected."""
+    decimal: str | None = None
+    """Decimal sign of its numbers. Default: detected."""
+    skip: int = 0
+    """Lines before it, which are left out."""
+    sheet: str | None = None
+    """Sheet of a workbook, or group of a TDMS file. Default: the only one with a table."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -468,7 +478,8 @@ class LogCommand(JsonOption, TableOptions):
     """
 
     files: Annotated[tuple[Path, ...], tyro.conf.Positional]
-    """CAN logs (MF4, BLF, ASC, TRC, candump, CSV, SQLite) or tables (CSV, Parquet, MATLAB, NumPy), in order."""
+    """CAN logs (MF4, BLF, ASC, TRC, candump, CSV, SQLite) or tables (CSV, Parquet, Arrow, MATLAB, NumPy), in order; or
+    a folder or ZIP archive of these."""
 
 
 @dataclass(frozen=True)

@@ -21,6 +21,7 @@ from sources.inspect import (
     is_table,
     quality_conditions,
 )
+from sources.tables.dialect import dialect_of
 from sources.tables.times import SERIAL_DAYS, UNITS, TimeColumn
 
 from ..format_time import FIRST_DATED_NS, duration_text, format_time
@@ -94,8 +95,9 @@ def contents_of(files: tuple[Path, ...], options: TableOptions) -> RecordingCont
     if options.time and tables and not any(tables):
         raise ConfigError(f"--time {quoted(options.time)}: is for tables, and {files[0]} is a CAN log; leave it out")
     time = TimeColumn(options.time or "", options.time_unit, options.time_format, options.time_zone)
+    how = dialect_of(options.heading, options.delimiter, options.decimal, options.skip, options.sheet, "--")
     more = f" and {len(files) - 1} more" if len(files) > 1 else ""
-    return attend(None, lambda: inspect_recordings(files, databases, time), f"reading {files[0].name}{more}")
+    return attend(None, lambda: inspect_recordings(files, databases, time, how), f"reading {files[0].name}{more}")
 
 
 def databases_of(options: TableOptions) -> list[tuple[Path, BusName]]:

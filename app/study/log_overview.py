@@ -17,6 +17,7 @@ from sources.can.database import load_database
 from sources.can.decoder import shown_id
 from sources.can.ids import KnownIds
 from sources.can.readers import BusName
+from sources.formats import files_of
 from sources.inspect import Message, RecordingContents, SignalSeries, inspect_recordings, is_table
 from sources.tables.rows import names_of
 from sources.tables.times import TimeColumn
@@ -127,10 +128,11 @@ def overview(
     Raises:
         SourceError: If the log cannot be read.
     """
-    if is_table(path):
-        yield from _of_table(path, time or TimeColumn(""))
+    files = files_of(path)
+    if all(map(is_table, files)):
+        yield from _of_table(path, files, time or TimeColumn(""))
         return
-    found = inspect_recordings([path])
+    found = inspect_recordings(files)
     ids = {message.key for message in found.messages}
     known = [_database(file, ids) for file in dict.fromkeys((*(databases or ()), *offered))]
     if databases is None:
@@ -140,7 +142,7 @@ def overview(
         broken = {one.file for one in known if one.error}
         used = [file for file in databases if str(file) not in broken]
     if used:
-        found = inspect_recordings([path], [(file, None) for file in used])
+        found = inspect_recordings(files, [(file, None) for file in used])
     yield from _proposed(found, _of(found, len(ids), known, [str(file) for file in used]))
 
 
@@ -180,7 +182,7 @@ def draft(
     """
     yield DraftStep("reading the log")
     buses: list[tuple[Path, BusName]] = [(file, None) for file in databases]
-    found = inspect_recordings([path], buses, time)
+    found = inspect_recordings(files_of(path), buses, time)
     yield DraftStep("estimating noises, time constants and gains")
     drafted = yield from fit_plan(plan(found, Roles(**{role: tuple(names) for role, names in roles.items()})))
     yield DraftStep("writing the twin")
@@ -194,11 +196,11 @@ def _summary(drafted: DraftPlan) -> str:
     return counted if drafted.check is None else f"{counted}; {drafted.check.words}"
 
 
-def _of_table(path: Path, time: TimeColumn) -> Iterator[LogOverview]:
+def _of_table(path: Path, files: Sequence[Path], time: TimeColumn) -> Iterator[LogOverview]:
     """Yield the overview of a table; if its time is not known, its columns."""
-    names = list(dict.fromkeys(names_of(path)))
+    names = list(dict.fromkeys(names_of(files[0])))
     try:
-        found = inspect_recordings([path], time=time)
+        found = inspect_recordings(files, time=time)
     except SourceError as error:
         if not names:
             raise

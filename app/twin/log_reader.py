@@ -15,13 +15,13 @@ from estimators.log import TRUTH, Log
 from sources.messages import FORGOTTEN, NO_BROKER, REFUSED_MESSAGE, REFUSED_TOPIC
 from sources.source import LOST_FRAMES, NEVER, NO_ASSET, TRUNCATED, UNASSIGNED, UNDATED, WRONG_TIME, is_endless
 from sources.tables.order import REMARKS as ORDER
-from sources.tables.text import UNREADABLE
+from sources.tables.text import READ_AS, UNREADABLE
 
 from ..terminal import complain
 from .ingest import CLOCK_MOVED, UNSET, Ingest
 from .twin import Twin, load_twin
 
-REMARKS = (*ORDER, NEVER, TRUNCATED, CLOCK_MOVED, UNSET)
+REMARKS = (*ORDER, NEVER, TRUNCATED, CLOCK_MOVED, UNSET, READ_AS)
 
 BROKERS = (NO_BROKER, REFUSED_MESSAGE, REFUSED_TOPIC)
 

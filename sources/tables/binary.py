@@ -1,8 +1,8 @@
-"""Parquet, MATLAB and NumPy files: their columns, and their rows a few thousand at a time.
+"""Parquet, Arrow, MATLAB and NumPy files: their columns, and their rows a few thousand at a time.
 
 The libraries that read them run in a process of their own, with limited memory (`sources/worker_process.py`).
 
-- Parquet: a column each.
+- Parquet, Arrow (Feather): a column each.
 - MATLAB up to version 7: every vector of numbers, named as in MATLAB: `meas.Voltage`, `runs(3).t` (counted from 1),
   or `speed` for a vector of its own.
 - NumPy archives: arrays whose first axis is time. A vector is a column under its own name; of an array of more axes
@@ -14,9 +14,10 @@ from __future__ import annotations
 import io
 import math
 import zipfile
-from collections.abc import Generator, Iterator, Sequence
+from collections.abc import Generator, Iterable, Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
@@ -27,6 +28,9 @@ from ..source import TRUNCATED
 from ..worker_process import gist, memory_error, memory_limit
 from .text import CHUNK_ROWS, Chunk, Column, Problem, TextCodes, TextMatch, column_of, fill
 
+if TYPE_CHECKING:
+    import pyarrow
+
 CHUNK_VALUES = 65_536
 """Values of a chunk of a NumPy archive; a row of a field has thousands."""
 
@@ -34,7 +38,7 @@ MAX_COLUMNS = 1_000_000  # Columns of a NumPy archive, each of which has a name
 
 
 @contextmanager
-def _readable(path: Path, kind: str) -> Iterator[None]:
+def readable(path: Path, kind: str) -> Iterator[None]:
     """Turn the errors of a library that reads a damaged file into one line; they have no common base."""
     try:
         yield
@@ -44,7 +48,7 @@ def _readable(path: Path, kind: str) -> Iterator[None]:
         raise SourceError(f"{path}: it cannot be read as {kind} ({gist(error)}); check that it is complete") from None
 
 
-def _content(path: Path) -> Path | io.BytesIO:
+def content_of(path: Path) -> Path | io.BytesIO:
     """Return what a library that seeks can read: the path, or the decompressed bytes."""
     if not is_compressed(path):
         return path
@@ -68,49 +72,91 @@ def parquet_names(path: Path, time: str = "") -> list[str]:
     """Return the columns of a Parquet file; raises SourceError if it is none, or cut short."""
     import pyarrow.parquet
 
-    with _readable(path, "Parquet"):
-        return list(pyarrow.parquet.read_schema(_content(path)).names)
+    with readable(path, "Parquet"):
+        return list(pyarrow.parquet.read_schema(content_of(path)).names)
+
+
+def arrow_names(path: Path, time: str = "") -> list[str]:
+    """Return the columns of an Arrow file or stream (Feather); raises SourceError if it is none, or cut short."""
+    with readable(path, "Arrow"), _arrow(path) as reader:
+        return list(reader.schema.names)
+
+
+def _arrow(path: Path) -> Any:
+    """Open an Arrow file; a stream, if it does not end as one."""
+    import pyarrow
+
+    source = pyarrow.PythonFile(content, "r") if isinstance(content := content_of(path), io.BytesIO) else content
+    try:
+        return pyarrow.ipc.open_file(source)
+    except pyarrow.ArrowInvalid:
+        if isinstance(content, io.BytesIO):
+            content.seek(0)
+        return pyarrow.ipc.open_stream(source)
+
+
+def read_arrow(path: Path, time: str, columns: Sequence[Column], problem: Problem) -> Generator[Chunk, None, None]:
+    """Yield the rows of an Arrow file or stream, as those of Parquet."""
+    wanted = list(dict.fromkeys((time, *map(column_of, columns))))
+    with readable(path, "Arrow"), _arrow(path) as reader:
+        count = getattr(reader, "num_record_batches", None)
+        whole = reader if count is None else map(reader.get_batch, range(count))
+        parts = (
+            part.select(wanted).slice(k, CHUNK_ROWS) for part in whole for k in range(0, part.num_rows, CHUNK_ROWS)
+        )
+        yield from _batches(parts, time, columns, problem)
 
 
 def read_parquet(path: Path, time: str, columns: Sequence[Column], problem: Problem) -> Generator[Chunk, None, None]:
     """Yield the rows of a Parquet file; null is blank, and text is read as in a CSV."""
-    import pyarrow
     import pyarrow.parquet
 
-    row = 1
-    with pyarrow.parquet.ParquetFile(_content(path)) as file:
+    row = 0
+    with pyarrow.parquet.ParquetFile(content_of(path)) as file:
         wanted = list(dict.fromkeys((time, *map(column_of, columns))))
         for k in range(file.num_row_groups):
             group = file.metadata.row_group(k)
             chunks = [group.column(j) for j in range(group.num_columns)]
             sizes = [chunk.total_uncompressed_size for chunk in chunks if chunk.path_in_schema in wanted]
             _check_size(path, sum(sizes))
-        for batch in file.iter_batches(CHUNK_ROWS, columns=wanted):
-            n = batch.num_rows
-            values = np.empty((n, len(columns)))
-            blank = np.zeros(values.shape, np.bool_)
-            lines = list(range(row, row + n))
-            words: tuple[str, ...] = ()
-            for k, name in enumerate(columns):
-                column = batch.column(column_of(name))
-                if not isinstance(name, str) or pyarrow.types.is_dictionary(column.type):
-                    column = column.cast(pyarrow.string())
-                blank[:, k] = column.is_null().to_numpy(zero_copy_only=False)
-                if isinstance(name, TextCodes):
-                    coded = column.dictionary_encode()
-                    words = tuple(coded.dictionary.to_pylist())
-                    values[:, k] = coded.indices.fill_null(-1).to_numpy(zero_copy_only=False)
-                    continue
-                if pyarrow.types.is_string(column.type) or pyarrow.types.is_large_string(column.type):
-                    cells = [item or "" for item in column.to_pylist()]
-                    fill(name, cells, lines, values[:, k], blank[:, k], problem)
-                else:
-                    numbers = column.cast(pyarrow.float64(), safe=False)
-                    values[:, k] = numbers.to_numpy(zero_copy_only=False)
-            yield Chunk(np.array(lines), batch.column(time), values, blank, words)
-            row += n
-        if row - 1 != file.metadata.num_rows:
-            problem(TRUNCATED, row, f"{row - 1} of {file.metadata.num_rows} rows are there")
+        for chunk in _batches(file.iter_batches(CHUNK_ROWS, columns=wanted), time, columns, problem):
+            yield chunk
+            row += len(chunk.line)
+        if row != file.metadata.num_rows:
+            problem(TRUNCATED, row + 1, f"{row} of {file.metadata.num_rows} rows are there")
+
+
+def _batches(
+    batches: Iterable[pyarrow.RecordBatch], time: str, columns: Sequence[Column], problem: Problem
+) -> Iterator[Chunk]:
+    """Yield the rows of batches of Arrow."""
+    import pyarrow
+
+    row = 1
+    for batch in batches:
+        n = batch.num_rows
+        values = np.empty((n, len(columns)))
+        blank = np.zeros(values.shape, np.bool_)
+        lines = list(range(row, row + n))
+        words: tuple[str, ...] = ()
+        for k, name in enumerate(columns):
+            column = batch.column(column_of(name))
+            if not isinstance(name, str) or pyarrow.types.is_dictionary(column.type):
+                column = column.cast(pyarrow.string())
+            blank[:, k] = column.is_null().to_numpy(zero_copy_only=False)
+            if isinstance(name, TextCodes):
+                coded = column.dictionary_encode()
+                words = tuple(coded.dictionary.to_pylist())
+                values[:, k] = coded.indices.fill_null(-1).to_numpy(zero_copy_only=False)
+                continue
+            if pyarrow.types.is_string(column.type) or pyarrow.types.is_large_string(column.type):
+                cells = [item or "" for item in column.to_pylist()]
+                fill(name, cells, lines, values[:, k], blank[:, k], problem)
+            else:
+                numbers = column.cast(pyarrow.float64(), safe=False)
+                values[:, k] = numbers.to_numpy(zero_copy_only=False)
+        yield Chunk(np.array(lines), batch.column(time), values, blank, words)
+        row += n
 
 
 def _numeric(path: Path, columns: Sequence[Column]) -> list[str]:
@@ -136,9 +182,9 @@ def mat_names(path: Path, time: str = "") -> list[str]:
 def _vectors(path: Path) -> dict[str, np.ndarray]:
     from scipy.io import loadmat
 
-    with _readable(path, "a MATLAB file"):
+    with readable(path, "a MATLAB file"):
         try:
-            content = loadmat(_content(path), squeeze_me=True, struct_as_record=False)
+            content = loadmat(content_of(path), squeeze_me=True, struct_as_record=False)
         except NotImplementedError:
             raise SourceError(f"{path}: it is MATLAB 7.3 (HDF5), which is not read; save it with -v7") from None
     found: dict[str, np.ndarray] = {}
@@ -170,7 +216,7 @@ def read_mat(path: Path, time: str, columns: Sequence[Column], problem: Problem)
                 f"{path}: {name} has {found[name].size} values and {time} has {found[time].size}; "
                 "take columns of one struct"
             )
-    yield from _chunks(
+    yield from chunks_of(
         found[time], {name: (found[name], [k], [0]) for k, name in enumerate(_numeric(path, columns))}, CHUNK_ROWS
     )
 
@@ -192,7 +238,7 @@ def npz_names(path: Path, time: str = "") -> list[str]:
 def _declared(path: Path) -> dict[str, tuple[tuple[int, ...], np.dtype]]:
     """Return shape and type of the arrays of numbers and dates in an archive, from their headers alone."""
     found = {}
-    with _readable(path, "a NumPy archive"), zipfile.ZipFile(_content(path)) as archive:
+    with readable(path, "a NumPy archive"), zipfile.ZipFile(content_of(path)) as archive:
         for item in archive.namelist():
             with archive.open(item) as file:
                 old = np.lib.format.read_magic(file) == (1, 0)
@@ -219,13 +265,13 @@ def read_npz(path: Path, time: str, columns: Sequence[Column], problem: Problem)
         places.append(k)
         cells.append(int(np.ravel_multi_index(cell, shape[1:])) if cell else 0)
     _check_size(path, sum(math.prod(declared[name][0]) * declared[name][1].itemsize for name in {time, *picks}))
-    with _readable(path, "a NumPy archive"), np.load(_content(path), allow_pickle=False) as archive:
+    with readable(path, "a NumPy archive"), np.load(content_of(path), allow_pickle=False) as archive:
         found = {name: archive[name] for name in {time, *picks}}
     arrays = {name: (found[name], places, cells) for name, (places, cells) in picks.items()}
-    yield from _chunks(found[time], arrays, max(1, CHUNK_VALUES // max(1, len(columns))))
+    yield from chunks_of(found[time], arrays, max(1, CHUNK_VALUES // max(1, len(columns))))
 
 
-def _chunks(
+def chunks_of(
     t: np.ndarray, arrays: dict[str, tuple[np.ndarray, list[int], list[int]]], step: int
 ) -> Generator[Chunk, None, None]:
     """Yield `step` rows at a time of arrays, each with the columns that it fills and the cells of a row to take."""

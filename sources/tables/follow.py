@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import csv
 import os
 import threading
 import time
@@ -22,9 +21,10 @@ from estimators.log import Events
 from ..formats import is_compressed, suffix_of
 from ..mapping import ABSENT, PRESENT
 from ..source import NEVER, NO_ASSET, TRUNCATED, AssetEvents, Channel, Numbers, Report, Source, ignore
+from .dialect import DETECTED, HEAD_BYTES, CsvFormat, Dialect, format_of
 from .rows import TableRows, dated, is_text, names_of, rows_of
 from .table import mapped
-from .text import HEAD_BYTES, UNREADABLE, Column, CsvFormat, TextCodes, chunk_of, column_of, format_of
+from .text import READ_AS, UNREADABLE, Column, TextCodes, chunk_of, column_of
 from .times import TimeColumn, TimeReader
 
 POLL_S = 0.1
@@ -86,6 +86,7 @@ class FollowedTable(Source):
         report: Called for rows and files that cannot be used, with file and line.
         asset: The column with the name of each row's asset; `read` then returns `AssetEvents`.
         ends: Whether the files are complete: the source ends after their last row.
+        dialect: How CSV files are written, as far as it is not detected.
 
     Raises:
         SourceError: If a present file lacks a column, or a unit does not convert.
@@ -103,10 +104,11 @@ class FollowedTable(Source):
         report: Report = ignore,
         asset: str | None = None,
         ends: bool = False,
+        dialect: Dialect = DETECTED,
     ) -> None:
         channels = list(channels)
         self.live = not ends
-        self._ends, self._asset = ends, asset
+        self._ends, self._asset, self._dialect = ends, asset, dialect
         self._list, self._time, self._width, self._report = files, time, width, report
         self._shift = round(time.shift * 1e9)
         self._columns, self._mapping = mapped(channels, width, report)
@@ -128,10 +130,10 @@ class FollowedTable(Source):
         for path in files():
             if _is_plain(path):
                 with path.open("rb") as file:
-                    self._format(path, file)
+                    self._format(path, file, None)
             elif not whole:  # the others when they are read: each takes a moment
                 whole = True
-                self._check(path, names_of(path))
+                self._check(path, names_of(path, "", self._dialect))
 
     def numbers(self, mark: int) -> dict[str, list[int]]:
         """Return the positions after the first `mark` pieces, for `restore`."""
@@ -241,7 +243,7 @@ class FollowedTable(Source):
         if not _is_plain(path):
             return self._rows(path, handle, file)
         if file.offset < HEAD_BYTES or file.format is None:
-            file.format = self._format(path, handle)
+            file.format = self._format(path, handle, file.format)
         handle.seek(file.offset)
         data = handle.read(PIECE_BYTES)
         end = data.rfind(b"\n") + 1
@@ -268,8 +270,8 @@ class FollowedTable(Source):
                 handle.seek(max(0, size - len(PARQUET_END)))
                 if handle.read() != PARQUET_END:
                     return None  # it is still being written
-            self._check(path, names_of(path))
-            file.rows = rows_of(path, self._time, self._read_columns, lambda: POLL_S)
+            self._check(path, names_of(path, "", self._dialect))
+            file.rows = rows_of(path, self._time, self._read_columns, lambda: POLL_S, self._dialect)
         try:
             for found in file.rows:
                 if found is None:
@@ -300,8 +302,8 @@ class FollowedTable(Source):
         if self._stores:
             self._unstored.append((self.mark, inode, state))
 
-    def _format(self, path: Path, handle: BinaryIO) -> CsvFormat | None:
-        """Return the format of a file, None while its first line is not complete.
+    def _format(self, path: Path, handle: BinaryIO, before: CsvFormat | None) -> CsvFormat | None:
+        """Return the format of a file, None while its first row is not complete; `before` is that of its first rows.
 
         Raises:
             SourceError: If it is no CSV, or lacks a column.
@@ -310,11 +312,14 @@ class FollowedTable(Source):
         head = handle.read(HEAD_BYTES)
         if b"\n" not in head:
             return None
-        # The last line is taken for one that is cut, and ignored.
-        found = format_of(path, head[: head.rfind(b"\n") + 1] + b"\n")
-        if found.encoding == "utf-16":
+        found = format_of(path, head[: head.rfind(b"\n") + 1], self._dialect)
+        if before is not None and before.settled:  # More rows show the signs of numbers only.
+            return before._replace(decimal=found.decimal, group=found.group, encoding=found.encoding)
+        if found.encoding.startswith("utf-16"):
             raise SourceError(f"{path}: is UTF-16; only UTF-8 or Windows-1252 can be followed")
         self._check(path, found.names)
+        if found.settled and found.remark:
+            self._report(READ_AS, f"{path.name}: {found.remark}")
         return found
 
     def _check(self, path: Path, names: Sequence[str]) -> None:
@@ -335,10 +340,10 @@ class FollowedTable(Source):
         rows, numbers = [], []
         problems: list[tuple[str, int, str]] = []
         for number, line in enumerate(lines, start=before + 1):
-            cells = next(csv.reader([line], delimiter=kind.delimiter), []) if line.strip() else []
-            if number == 1 or not cells:
+            cells: list[str] = next(kind.cells([line]), []) if number >= kind.first and line.strip() else []
+            if not cells:
                 continue
-            if len(cells) != len(kind.names) or line.count('"') % 2:
+            if not kind.fits(cells) or line.count('"') % 2:
                 text = f"has {len(cells)} cells, not {len(kind.names)}; the row is left out"
                 problems.append((UNREADABLE, number, text))
                 continue

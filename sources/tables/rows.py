@@ -6,8 +6,9 @@ Text is read in this process; other formats in a process of their own, since the
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Sequence
+from itertools import chain
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 
@@ -16,27 +17,34 @@ from estimators.errors import SourceError, quoted
 from .. import formats
 from ..source import UNDATED
 from ..worker_process import IsolatedReader, read_isolated
-from .binary import mat_names, npz_names, parquet_names, read_mat, read_npz, read_parquet
-from .text import Chunk, Column, Problem, csv_format, read_csv
+from .binary import arrow_names, mat_names, npz_names, parquet_names, read_arrow, read_mat, read_npz, read_parquet
+from .dialect import DETECTED, Dialect
+from .text import Chunk, Column, csv_format, csv_rows, read_csv
 from .times import TimeColumn, TimeReader
 
-_Names = Callable[[Path, str], list[str]]
-_Read = Callable[[Path, Any, Sequence[Column], Problem], Iterator[Chunk]]
+_Names = Callable[..., list[str]]
+_Read = Callable[..., Iterator[Chunk]]
 
 
 class TableFormat(NamedTuple):
     """How a table that is no CSV is read, in a process of its own; its functions are importable by name.
 
     `names(path, time)`, `read(path, time, columns, problem)`. Rows of a `sparse` one have only some of the columns.
+    With `dialect`, the functions take a `Dialect` as the last argument. One whose `cells` are text, as lists of rows by
+    `cells(path, dialect)`, may have two columns of time: `read` takes the names of the time.
     """
 
     names: _Names
     read: _Read
     sparse: bool = False
+    dialect: bool = False
+    cells: Callable[..., Iterator[list[list[str]]]] | None = None
 
 
 _FORMATS = {
+    ".arrow": TableFormat(arrow_names, read_arrow),
     ".csv": None,
+    ".feather": TableFormat(arrow_names, read_arrow),
     ".mat": TableFormat(mat_names, read_mat),
     ".npz": TableFormat(npz_names, read_npz),
     ".parquet": TableFormat(parquet_names, read_parquet),
@@ -88,7 +96,15 @@ def is_text(path: Path) -> bool:
     return format_of(path) is None
 
 
-def names_of(path: Path, time: str = "") -> list[str]:
+def cells_of(path: Path, dialect: Dialect = DETECTED) -> Iterator[list[str]] | None:
+    """Return the cells of the rows of a table of text; None of any other one."""
+    form = format_of(path)
+    if form is None:
+        return csv_rows(path, dialect)
+    return None if form.cells is None else chain.from_iterable(read_isolated(form.cells, path, dialect))
+
+
+def names_of(path: Path, time: str = "", dialect: Dialect = DETECTED) -> list[str]:
     """Return the names of a table's columns, or of those with as many rows as column `time`.
 
     Raises:
@@ -96,16 +112,29 @@ def names_of(path: Path, time: str = "") -> list[str]:
     """
     form = format_of(path)
     if form is None:
-        return csv_format(path).names
+        return list(csv_format(path, dialect).names)
     try:
-        found: list[str] = read_isolated(_names, path, time, form)[0]
+        found: list[str] = read_isolated(_names, path, time, form, dialect)[0]
     except SourceError as error:
         raise _about(path, error) from None
     return found
 
 
+def remarks_of(files: Sequence[Path], dialect: Dialect = DETECTED) -> list[str]:
+    """Return what was assumed about the format of CSV files, where it is not plain: a line for all with the same."""
+    found: dict[str, list[str]] = {}
+    for path in files:
+        if is_text(path) and (remark := csv_format(path, dialect).remark):
+            found.setdefault(remark, []).append(path.name)
+    return [f"{n[0]}{f' and {len(n) - 1} more' * (len(n) > 1)}: {remark}" for remark, n in found.items()]
+
+
 def rows_of(
-    path: Path, time: TimeColumn, columns: Sequence[Column], timeout: Callable[[], float]
+    path: Path,
+    time: TimeColumn,
+    columns: Sequence[Column],
+    timeout: Callable[[], float],
+    dialect: Dialect = DETECTED,
 ) -> Iterator[TableRows | None]:
     """Yield the rows of a table, some thousands at once; None where none came within `timeout()` seconds.
 
@@ -114,9 +143,9 @@ def rows_of(
     """
     form = format_of(path)
     if form is None:
-        yield from read_rows(path, time, columns, form)
+        yield from read_rows(path, time, columns, form, dialect)
         return
-    reader = IsolatedReader(read_rows, path, time, columns, form)
+    reader = IsolatedReader(read_rows, path, time, columns, form, dialect)
     try:
         while not reader.ended:
             item = reader.get(timeout())
@@ -134,7 +163,9 @@ def _about(path: Path, error: SourceError) -> SourceError:
     return error if known else SourceError(f"{path}: it cannot be read ({error}); check that it is complete")
 
 
-def read_rows(path: Path, time: TimeColumn, columns: Sequence[Column], form: TableFormat | None) -> Iterator[TableRows]:
+def read_rows(
+    path: Path, time: TimeColumn, columns: Sequence[Column], form: TableFormat | None, dialect: Dialect = DETECTED
+) -> Iterator[TableRows]:
     """Yield the rows of a table in this process, which may know no extension; `form` is that of `format_of`."""
     problems: list[tuple[str, int, str]] = []
 
@@ -143,12 +174,13 @@ def read_rows(path: Path, time: TimeColumn, columns: Sequence[Column], form: Tab
         problems.clear()
         return found
 
-    text = form is None
+    text = form is None or form.cells is not None
     if time.clock is not None and not text:
-        raise SourceError(f"{path}: {time.label} are two columns, which only a CSV may have; give one column of times")
+        raise SourceError(f"{path}: {time.label} are two columns, which only text may have; give one column of times")
     read = read_csv if form is None else form.read
+    more = (dialect,) if form is None or form.dialect else ()
     times = TimeReader(time, path)
-    for chunk in read(path, time.names if text else time.name, columns, lambda *problem: problems.append(problem)):
+    for chunk in read(path, time.names if text else time.name, columns, lambda *one: problems.append(one), *more):
         yield dated(chunk, times, time, problems)._replace(problems=taken())
     if problems:
         none = np.zeros(0, np.int64)
@@ -175,5 +207,5 @@ def _undated(time: TimeColumn, cell: object) -> str:
     return f"{time.label} is {quoted(text)}, which {rule}; the row is left out: correct it, or give its unit or format"
 
 
-def _names(path: Path, time: str, form: TableFormat) -> Iterator[list[str]]:
-    yield form.names(path, time)
+def _names(path: Path, time: str, form: TableFormat, dialect: Dialect) -> Iterator[list[str]]:
+    yield form.names(path, time, dialect) if form.dialect else form.names(path, time)

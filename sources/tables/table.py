@@ -16,9 +16,10 @@ from ..formats import check_present, suffix_of
 from ..mapping import ABSENT, PRESENT, ChannelMapping
 from ..source import NEVER, TRUNCATED, UNASSIGNED, Channel, Recorded, Report, ignore
 from ..units import heading_unit
+from .dialect import DETECTED, Dialect
 from .order import Order
-from .rows import TableRows, names_of, rows_of
-from .text import TextMatch, column_of, has_rows
+from .rows import TableRows, names_of, remarks_of, rows_of
+from .text import READ_AS, TextMatch, column_of, has_rows
 from .times import SERIAL_DAYS, UNITS, TimeColumn
 
 BATCH_EVENTS = 4096  # Events that are returned at once
@@ -39,6 +40,7 @@ class Table(Recorded):
         report: Called for rows without a time and values that are not numbers, with file and line; and once of rows
             that were sorted, and of times that run backwards or stand still.
         horizon: Seconds by which a row may be older than one before it without being sorted; None for any.
+        dialect: How CSV files are written, as far as it is not detected.
 
     Raises:
         SourceError: If a file or column is missing, or a unit does not convert.
@@ -53,6 +55,7 @@ class Table(Recorded):
         width: int,
         report: Report = ignore,
         horizon: float | None = None,
+        dialect: Dialect = DETECTED,
     ) -> None:
         self._files = [Path(file) for file in files]
         if not self._files:
@@ -61,11 +64,13 @@ class Table(Recorded):
         if time.unit not in units:
             raise SourceError(f"table: the time unit is {time.unit!r}; choose from {', '.join(units)}")
         channels = list(channels)
-        self._time, self._width, self._report = time, width, report
+        self._time, self._width, self._report, self._dialect = time, width, report, dialect
         self._shift = round(time.shift * 1e9)
         self._columns, self._mapping = mapped(channels, width, report)
         for path in self._files:
-            _check(path, [*time.names, *map(column_of, self._columns)])
+            _check(path, [*time.names, *map(column_of, self._columns)], dialect)
+        for text in remarks_of(self._files, dialect):
+            report(READ_AS, text)
         self._channels = channels
         self._selectors = _selectors(channels, self._columns)
         self._valued: set[str | TextMatch] = set()
@@ -91,7 +96,7 @@ class Table(Recorded):
     def _one(self, path: Path) -> Generator[Events, None, None]:
         before = self._count
         try:
-            for rows in rows_of(path, self._time, self._columns, lambda: self._timeout):
+            for rows in rows_of(path, self._time, self._columns, lambda: self._timeout, self._dialect):
                 first = self._count == before
                 batch = Events.empty(self._width) if rows is None else self._events(path, rows, first)
                 yield batch
@@ -157,14 +162,14 @@ def _selectors(
     return found
 
 
-def _check(path: Path, wanted: Sequence[str]) -> None:
+def _check(path: Path, wanted: Sequence[str], dialect: Dialect) -> None:
     """Refuse a file that lacks a column, or rows, or that is no table at all.
 
     Raises:
         SourceError: Naming the file, the column and those that are near.
     """
     check_present(path)
-    names = names_of(path)
+    names = names_of(path, "", dialect)
     found = Counter(names)
     for name in wanted:
         if name not in found:
@@ -173,7 +178,7 @@ def _check(path: Path, wanted: Sequence[str]) -> None:
             at = [k for k, other in enumerate(names, start=1) if other == name]
             places = " and ".join(f"the {_ordinal(k)}" for k in at[:2])
             raise SourceError(f"{path}: there are {len(at)} columns {name!r}, {places}; give each its own name")
-    if suffix_of(path) == ".csv" and not has_rows(path):
+    if suffix_of(path) == ".csv" and not has_rows(path, dialect):
         raise SourceError(f"{path}: it has a header and no rows; record it again")
 
 

@@ -14,23 +14,16 @@ import numpy as np
 
 from estimators.errors import SourceError, quoted
 
-from ..formats import open_binary, refuse_others
+from ..formats import UNREADABLE_ERRORS, open_binary
 from ..source import TRUNCATED
+from .dialect import DETECTED, HEAD_BYTES, QUALITY_WORD, CsvFormat, Dialect, format_of
 
 CHUNK_ROWS = 4096  # Rows of a chunk, at most
+MAX_PREAMBLE_BYTES = 2**20  # Bytes after the first ones in which a table is sought
 MAX_LINE_LENGTH = 2**20  # Characters of a line; a longer one is read as several
-HEAD_BYTES = 65_536  # Bytes from which the format of a CSV is detected
+READ_AS = "format of a table"  # Key of what was assumed about the format
 UNREADABLE = "unreadable value"  # Key of values that are not numbers
 NO_VALUE = "no value "  # Begin of the key of words that stand for a missing value: no value TT1: Bad
-
-QUALITY_WORD = re.compile(
-    r"(\[-?\d+\] *)?(bad|uncertain|questionable|invalid|error|fault|fail(ed|ure)?|stale|offline|shutdown|scan off"
-    r"|disconnect|(over|under) ?range|no (data|good|result|sample|value)|not connected|out of (service|range)"
-    r"|comm\w* (fail|error)|(i/?o |intf )?(time ?out|shut)|calc failed|pt created|configure)\b.*"
-    r"|#(n/a|value!|div/0!|ref!|num!)",
-    re.IGNORECASE,
-)
-"""Words by which historians, OPC servers and spreadsheets mark a value that there is not."""
 
 Problem = Callable[[str, int, str], None]
 """problem(key, line or row number, text)."""
@@ -56,15 +49,6 @@ Column = str | TextMatch | TextCodes
 """Column of the reader: numbers of a column of the file, or what its texts are."""
 
 
-class CsvFormat(NamedTuple):
-    """Columns of a CSV, the delimiter of its cells, the decimal sign of its numbers, and its encoding."""
-
-    names: list[str]
-    delimiter: str
-    decimal: str
-    encoding: str
-
-
 class Chunk(NamedTuple):
     """TableRows of a table: the raw time column, the values (n, columns), and a mask of blank ones.
 
@@ -79,106 +63,101 @@ class Chunk(NamedTuple):
     words: tuple[str, ...] = ()
 
 
-def open_text(path: Path, encoding: str = "utf-8-sig") -> TextIO:
+def open_text(path: Path, kind: CsvFormat) -> TextIO:
     """Open a CSV; bytes that are not of its encoding are replaced."""
-    return io.TextIOWrapper(open_binary(path), encoding=encoding, errors="replace", newline="")
+    return io.TextIOWrapper(open_binary(path), encoding=kind.encoding, errors="replace", newline="")
 
 
-def csv_format(path: Path) -> CsvFormat:
-    """Return the format of a CSV, detected from its first lines.
+def after_heading(file: TextIO, kind: CsvFormat) -> TextIO:
+    """Return an open CSV after its heading."""
+    for _ in range(kind.first - 1):
+        file.readline(MAX_LINE_LENGTH)
+    return file
 
-    Files that are not UTF-8 are read as Windows-1252, or as UTF-16 if they begin with its mark. The decimal sign is a
-    comma if the delimiter is another sign and a number is written with one.
+
+def csv_rows(path: Path, given: Dialect = DETECTED) -> Iterator[list[str]]:
+    """Yield the cells of the rows of a CSV."""
+    kind = csv_format(path, given)
+    with open_text(path, kind) as file:
+        yield from filter(kind.fits, kind.cells(after_heading(file, kind)))
+
+
+def csv_format(path: Path, given: Dialect = DETECTED) -> CsvFormat:
+    """Return the format of a CSV, detected from its first lines as far as it is not given.
 
     Raises:
-        SourceError: If the file begins with bytes that are not text, or cannot be decompressed.
+        SourceError: If the file cannot be decompressed, or as `format_of`.
     """
     try:
         with open_binary(path) as binary:
-            head = binary.read(HEAD_BYTES)
-    except OSError as error:
-        raise SourceError(f"{path}: it cannot be read ({error.strerror or error}); check that it is complete") from None
-    return format_of(path, head)
+            found = format_of(path, head := binary.read(HEAD_BYTES), given)
+            if not found.settled and len(head) == HEAD_BYTES:
+                found = format_of(path, head + binary.read(MAX_PREAMBLE_BYTES), given)
+            return found
+    except UNREADABLE_ERRORS as error:
+        why = getattr(error, "strerror", None) or error
+        raise SourceError(f"{path}: it cannot be read ({why}); check that it is complete") from None
 
 
-def format_of(path: Path, head: bytes) -> CsvFormat:
-    """Return the format of a CSV that begins with these bytes.
-
-    Raises:
-        SourceError: If they are not text.
-    """
-    refuse_others(path, head)
-    encoding = "utf-16" if head.startswith((b"\xff\xfe", b"\xfe\xff")) else _single_bytes(head)
-    if encoding != "utf-16" and any(byte < 9 or 13 < byte < 32 for byte in head[:4096]):
-        raise SourceError(
-            f"{path}:1: it begins with the bytes {head[:8].hex(' ')} and is not text; give a CSV in UTF-8, "
-            "or name the file by its format (.parquet, .mat, .npz)"
-        )
-    lines = head.decode(encoding, "replace").splitlines()
-    first = lines[0] if lines else ""
-    delimiter = max(",;\t|", key=first.count)
-    names = next(csv.reader([first], delimiter=delimiter), [])
-    cells = (cell for line in lines[1:-1] or lines[1:] for cell in line.split(delimiter))
-    comma = delimiter != "," and any(_COMMA.fullmatch(cell.strip()) for cell in cells)
-    return CsvFormat([name.strip() for name in names], delimiter, "," if comma else ".", encoding)
-
-
-def _single_bytes(head: bytes) -> str:
-    try:
-        head.decode("utf-8")
-    except UnicodeDecodeError as error:
-        if error.start < len(head) - 4:  # not merely cut within a character
-            return "cp1252"
-    return "utf-8-sig"
-
-
-def has_rows(path: Path) -> bool:
-    """Return whether anything follows the first line of a CSV."""
-    with suppress(OSError), open_text(path) as file:
-        file.readline(MAX_LINE_LENGTH)
-        return any(line.strip() for line in file)
+def has_rows(path: Path, given: Dialect = DETECTED) -> bool:
+    """Return whether anything follows the heading of a CSV."""
+    with suppress(*UNREADABLE_ERRORS):
+        kind = csv_format(path, given)
+        with open_text(path, kind) as file:
+            return kind.settled or any(line.strip() for line in after_heading(file, kind))
     return True  # What is wrong with the file is reported when its rows are read.
 
 
-def read_csv(path: Path, time: Sequence[str], columns: Sequence[Column], problem: Problem) -> Iterator[Chunk]:
+def read_csv(
+    path: Path, time: Sequence[str], columns: Sequence[Column], problem: Problem, given: Dialect = DETECTED
+) -> Iterator[Chunk]:
     """Yield the rows of a CSV; a value that is not a number is missing and reported, as is a row cut short."""
-    kind = csv_format(path)
-    names, delimiter, _, encoding = kind
-    broken: tuple[int, int] | None = None
+    kind = csv_format(path, given)
+    with open_text(path, kind) as file:
+        yield from read_text(file, kind, time, columns, problem)
+
+
+def read_text(
+    file: TextIO, kind: CsvFormat, time: Sequence[str], columns: Sequence[Column], problem: Problem
+) -> Iterator[Chunk]:
+    """Yield the rows of a CSV, see `read_csv`."""
+    width, before = len(kind.names), kind.first - 1
+    broken: tuple[int, list[str]] | None = None
     raw: list[str] = []
-    with open_text(path, encoding) as file:
-        reader = csv.reader(_lines(file, raw), delimiter=delimiter)
-        next(reader)
-        ended = False
-        while not ended:
-            rows: list[list[str]] = []
-            lines: list[int] = []
-            while len(rows) < CHUNK_ROWS and not ended:
-                raw.clear()
-                fault = ""
-                try:
-                    row = next(reader, None)
-                except (csv.Error, OSError) as error:
-                    row, fault = None, f"{error}; the rest is left out"
-                if len(raw) > 1 and sum(line.count('"') for line in raw) % 2:
-                    # Quotes come in pairs, so this one took all that follows for one cell.
-                    after = "all after it" if fault else f"the {len(raw) - 1} after it"
-                    row, fault = None, f"a quote is opened and not closed; this line and {after} are left out"
-                if fault:
-                    problem(TRUNCATED, reader.line_num - len(raw) + 1, fault)
-                if row is None:
-                    ended = True
-                elif row:
-                    if broken is not None:
-                        problem(UNREADABLE, broken[0], f"has {broken[1]} cells, not {len(names)}; the row is left out")
-                    broken = None if len(row) == len(names) else (reader.line_num, len(row))
-                    if broken is None:
-                        rows.append(row)
-                        lines.append(reader.line_num)
-            if rows:
-                yield chunk_of(rows, lines, kind, time, columns, problem)
+    reader = kind.cells(_lines(after_heading(file, kind), raw))
+    ended = False
+    while not ended:
+        rows: list[list[str]] = []
+        lines: list[int] = []
+        while len(rows) < CHUNK_ROWS and not ended:
+            raw.clear()
+            fault = ""
+            try:
+                row = next(reader, None)
+            except (csv.Error, *UNREADABLE_ERRORS) as error:
+                row, fault = None, f"{error}; the rest is left out"
+            if len(raw) > 1 and sum(line.count('"') for line in raw) % 2:
+                # Quotes come in pairs, so this one took all that follows for one cell.
+                after = "all after it" if fault else f"the {len(raw) - 1} after it"
+                row, fault = None, f"a quote is opened and not closed; this line and {after} are left out"
+            if fault:
+                problem(TRUNCATED, before + reader.line_num - len(raw) + 1, fault)
+            if row is None:
+                ended = True
+            elif row:
+                if broken is not None:
+                    problem(UNREADABLE, broken[0], f"has {len(broken[1])} cells, not {width}; the row is left out")
+                broken = None if len(row) == width or kind.fits(row) else (before + reader.line_num, row)
+                if broken is None:
+                    rows.append(row)
+                    lines.append(before + reader.line_num)
+        if rows:
+            yield chunk_of(rows, lines, kind, time, columns, problem)
     if broken is not None:
-        problem(TRUNCATED, broken[0], f"the last line has {broken[1]} cells, not {len(names)}")
+        footer = len(broken[1]) == 1 and not any(map(str.isdigit, broken[1][0]))
+        text = f"is {quoted(broken[1][0].strip())}, which is no row of the table; it is left out"
+        cut = f"the last line has {len(broken[1])} cells, not {width}"
+        problem(UNREADABLE if footer else TRUNCATED, broken[0], text if footer else cut)
 
 
 def chunk_of(
@@ -200,12 +179,12 @@ def chunk_of(
             values[:, k] = [codes.setdefault(cell, len(codes)) for cell in cells]
             blank[:, k] = [not cell for cell in cells]
             continue
-        fill(name, [row[place] for row in rows], lines, values[:, k], blank[:, k], problem, kind.decimal)
+        fill(name, [row[place] for row in rows], lines, values[:, k], blank[:, k], problem, kind.decimal, kind.group)
     at_time = [kind.names.index(name) for name in time]
     parts = ([row[place].strip() for place in at_time] for row in rows)
     times = [" ".join(part) if all(part) else "" for part in parts]
-    if kind.decimal == ",":
-        times = [_with_point(cell) or cell for cell in times]
+    if kind.decimal == "," or kind.group:
+        times = [cell if one == "?" else one for one, cell in zip(_plain(times, kind.decimal, kind.group), times)]
     return Chunk(np.array(lines), times, values, blank, tuple(codes))
 
 
@@ -219,10 +198,22 @@ def _lines(file: TextIO, raw: list[str]) -> Iterator[str]:
 _COMMA = re.compile(r"[+-]?(?:\d*|\d{1,3}(?:\.\d{3})+),\d+(?:[eE][+-]?\d+)?")
 
 
-def _with_point(cell: str) -> str | None:
+def _with_point(text: str) -> str | None:
     """Return a number that is written with a decimal comma as one with a point; None of anything else."""
-    text = cell.strip()
+    text = text.strip()
     return text.replace(".", "").replace(",", ".") if _COMMA.fullmatch(text) else None
+
+
+def _plain(cells: list[str], decimal: str, group: str) -> list[str]:
+    """Return numbers as Python writes them; "?" in place of one with a point in a table of decimal commas."""
+    if group:
+        pattern = re.compile(rf"\s*[+-]?\d{{1,3}}(?:[{group}]\d{{3}})+(?:\{decimal}\d*)?(?:[eE][+-]?\d+)?\s*")
+        bare = str.maketrans({sign: "" for sign in group} | {decimal: "."})
+        found = [cell.translate(bare) if pattern.fullmatch(cell) else "" for cell in cells]
+    if decimal != ",":
+        return [one or cell for one, cell in zip(found, cells)] if group else cells
+    texts = [_with_point(cell) or ("?" if "." in cell else cell) for cell in cells]
+    return [one or text for one, text in zip(found, texts)] if group else texts
 
 
 def column_of(name: Column) -> str:
@@ -245,15 +236,17 @@ def fill(
     blank: np.ndarray,
     problem: Problem,
     decimal: str = ".",
+    group: str = "",
 ) -> None:
-    """Fill a column of values, and its mask of blank ones, from text; with a decimal comma, a point is an error."""
+    """Fill a column of values, and its mask of blank ones, from text; with a decimal comma, a point is an error.
+
+    `group` are the signs between thousands.
+    """
     if isinstance(name, TextMatch):
         values[:] = [cell.strip() in name.texts for cell in cells]
         blank[:] = [not cell.strip() for cell in cells]
         return
-    texts = cells
-    if decimal == ",":
-        texts = [_with_point(cell) or ("?" if "." in cell else cell) for cell in cells]
+    texts = _plain(cells, decimal, group)
     try:
         if "_" not in "".join(texts):
             values[:] = [float(cell) for cell in texts]

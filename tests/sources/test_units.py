@@ -37,6 +37,7 @@ def test_what_is_refused_says_why(given, reason):
     with pytest.raises(SourceError, match=reason):
         conversion(given, "m", "x")
     assert heading_unit(f"Value [{given}]") == given
+    assert heading_unit("Value [m/0]") is None
 
 
 @cases(__file__, "no_conversions.csv")

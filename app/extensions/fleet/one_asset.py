@@ -26,9 +26,10 @@ def rows_of_asset(files: Sequence[Path], column: str, asset: str, columns: Seque
     found = []
     for number, path in enumerate(files):
         copy = folder / f"{number}-{path.name}"
-        if is_text(path) and not is_compressed(path) and csv_format(path).encoding != "utf-16":
+        kind = csv_format(path) if is_text(path) and not is_compressed(path) else None
+        if kind is not None and not kind.encoding.startswith("utf-16") and kind.first == 2:
             with path.open("rb") as file, copy.open("wb") as out:
-                out.writelines(_lines(file.fileno(), asset.encode(csv_format(path).encoding.removesuffix("-sig"))))
+                out.writelines(_lines(file.fileno(), asset.encode(kind.encoding.removesuffix("-sig"))))
         elif suffix_of(path) in (".parquet", ".pq") and not is_compressed(path):
             _copy_parquet(path, column, asset, columns, copy)
         else:

@@ -13,7 +13,7 @@ from config.yaml_files import ValuePlaces, shown_path
 from estimators.errors import ConfigError, SourceError, is_blank, nearest, quoted
 from estimators.fleet.tunings import GROUPS, out_of_range
 from estimators.tuning import Tuning
-from sources.tables.text import csv_format, open_text
+from sources.tables.text import after_heading, csv_format, open_text
 from sources.units import conversion, heading_unit
 
 from .schema import AssetTuningsSection
@@ -106,11 +106,13 @@ def _read(file: Path, asset_column: str, tuning: Tuning) -> Cells:
     shown = shown_path(file)
     try:
         form = csv_format(file)
-        with open_text(file, form.encoding) as text:
-            rows = [(line, row) for line, row in enumerate(csv.reader(text, delimiter=form.delimiter), 1) if any(row)]
+        with open_text(file, form) as text:
+            rows = [
+                (line, row) for line, row in enumerate(form.cells(after_heading(text, form)), form.first) if any(row)
+            ]
     except (OSError, SourceError, csv.Error) as error:
         raise ConfigError(f"{shown}: cannot be read: {error}") from None
-    heads = [head.strip() for head in rows[0][1]] if rows else []
+    heads = form.names
     if asset_column not in heads:
         raise ConfigError(f"{shown}:1: has no column {quoted(asset_column)}; {nearest(asset_column, heads)}")
     units = {item.key: item.unit for item in tuning.items()}
@@ -127,7 +129,7 @@ def _read(file: Path, asset_column: str, tuning: Tuning) -> Cells:
             raise ConfigError(str(error)) from None
         factors[k] = key, factor, offset
     cells: Cells = {}
-    for line, row in rows[1:]:
+    for line, row in rows:
         name = row[heads.index(asset_column)].strip() if len(row) == len(heads) else ""
         if not name:
             rule = f"has {len(row)} cells and the heading {len(heads)}" if len(row) != len(heads) else "names no asset"

@@ -368,6 +368,8 @@ def _source(
                 if (value := getattr(part.time, key)) is not None
             }
             lines.append(f"time: {{{', '.join(f'{key}: {value}' for key, value in keys.items())}}}")
+            given = part.dialect._asdict() | ({"heading": "none"} if part.dialect.heading == 0 else {})
+            lines += [f"{key}: {_text(value)}" for key, value in given.items() if value]
         channels = [
             _channel(family.name, reads.signal, family) if family else _channel(reads.name, reads.signal)
             for reads in read

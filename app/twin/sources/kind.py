@@ -16,7 +16,7 @@ from config.yaml_files import Key, dotted
 from estimators.errors import NisusError, SourceError
 from estimators.log import READING
 from estimators.model.state_space import Sensor, StateSpaceModel
-from sources.formats import check_once, files_of, is_whole, suffix_of, tables
+from sources.formats import check_once, files_of, is_file, is_whole, suffix_of, tables
 
 from ..channels import channel_of, channels
 
@@ -113,11 +113,9 @@ def find_recording(
     if log_files is not None:
         files = [file for given in log_files for file in files_of(given.expanduser())]
         for file in files:
-            if file.is_dir():
-                raise SourceError(f"--log {file}: it is a folder; name the files in it")
-            if not file.exists():
+            if not is_file(file) and not file.exists():
                 raise SourceError(f"--log {file}: there is no such file; check the path")
-            if not file.is_file():
+            if not is_file(file):
                 raise SourceError(f"--log {file}: it is a device or a pipe; name a file, which can be read again")
         check_once(files, "--log ")
         return files
@@ -142,9 +140,10 @@ def matching(loaded: Loaded, section: CanSection | RecordingSection, pattern: st
     root = _root(loaded, section)
     wanted = str(Path(pattern).expanduser())
     exact = root / wanted  # A name with brackets in it is itself before it is a pattern.
-    if _is_recording(exact):
+    followed = isinstance(section, TableSection) and section.follow
+    if _is_recording(exact) or (exact.is_dir() and not followed):
         return [exact]
-    if exact.is_dir() and isinstance(section, TableSection) and section.follow:
+    if exact.is_dir():
         files = [path for path in exact.iterdir() if path.is_file() and suffix_of(path) in tables()]
         return sorted(path for path in files if not path.name.startswith("."))
     escaped = wanted if os.path.isabs(wanted) else os.path.join(glob.escape(str(root)), wanted)
@@ -153,7 +152,7 @@ def matching(loaded: Loaded, section: CanSection | RecordingSection, pattern: st
 
 def _is_recording(path: Path) -> bool:
     """Return whether it is a file, or a folder that is one."""
-    return path.is_file() or is_whole(path)
+    return is_file(path) or is_whole(path)
 
 
 def find_databases(

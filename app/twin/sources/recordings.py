@@ -20,11 +20,12 @@ from sources.source import span_of
 
 from ..ingest import Ingest
 from .can import CAN_LOG
-from .kind import Kind, Opening, blamed, closed, find_recording, matching
+from .kind import Kind, Opening, blamed, closed, failure, find_recording, matching
 
 if TYPE_CHECKING:
     from config.fields import Section
     from sources.source import Channel, Source
+    from sources.tables.dialect import Dialect
     from sources.tables.times import TimeColumn
 
 
@@ -115,6 +116,7 @@ def _sections(section: MergedSection, key: Key) -> dict[Key, Section]:
 
 
 def _open_table(opening: Opening) -> Source:
+    from sources.tables.dialect import dialect_of
     from sources.tables.table import Table
     from sources.tables.times import TimeColumn
 
@@ -122,8 +124,12 @@ def _open_table(opening: Opening) -> Source:
     own = section.time
     name, *clock = own.column
     time = TimeColumn(name, own.unit, own.format, own.zone, clock[0] if clock else None, own.date, own.shift)
+    try:
+        dialect = dialect_of(section.heading, section.delimiter, section.decimal, section.skip, section.sheet)
+    except SourceError as error:
+        raise failure(opening.loaded, opening.key, str(error), ".") from None
     if opening.of_assets or (section.follow and opening.live and opening.log_files is None):
-        return _follow(opening, section, time)
+        return _follow(opening, section, time, dialect)
     files = find_recording(opening.loaded, section, opening.key, opening.log_files)
 
     def table(channels: list[Channel]) -> Table:
@@ -134,12 +140,13 @@ def _open_table(opening: Opening) -> Source:
             width=opening.model.width,
             report=opening.report,
             horizon=opening.loaded.config.time.max_delay,
+            dialect=dialect,
         )
 
     return blamed(opening, table)
 
 
-def _follow(opening: Opening, section: TableSection, time: TimeColumn) -> Source:
+def _follow(opening: Opening, section: TableSection, time: TimeColumn, dialect: Dialect) -> Source:
     from sources.tables.follow import FollowedTable
 
     recorded = [] if section.follow else find_recording(opening.loaded, section, opening.key, None)
@@ -152,8 +159,9 @@ def _follow(opening: Opening, section: TableSection, time: TimeColumn) -> Source
     width, report = opening.model.width, opening.report
 
     def table(channels: list[Channel]) -> FollowedTable:
+        ends = not section.follow
         return FollowedTable(
-            files, time=time, channels=channels, width=width, report=report, asset=asset, ends=not section.follow
+            files, time=time, channels=channels, width=width, report=report, asset=asset, ends=ends, dialect=dialect
         )
 
     return blamed(opening, table)

@@ -3,6 +3,7 @@
 import can
 import numpy as np
 import pytest
+import yaml
 
 from app.study.advice.signals import noise_of
 from app.twin.twin import load_twin
@@ -182,12 +183,26 @@ def test_a_file_of_which_no_twin_can_be_drafted_is_refused_with_the_remedy(
     assert not list(drive.glob("pump*"))
 
 
+def test_a_draft_keeps_the_dialect_that_was_given_and_fits_its_log(tmp_path, nisus):
+    """A random walk of 0.1 a second, with noise of 0.05, in a dialect that is not detected."""
+    rng = np.random.default_rng(0)
+    walk = 20 + np.cumsum(rng.normal(0, 0.1, 600)) + rng.normal(0, 0.05, 600)
+    rows = "".join(f"{k}^{x:.3f}\n" for k, x in enumerate(walk))
+    (tmp_path / "a.csv").write_text("Plant 7\nRate^1\nno^TT102\ntime^TT101\n" + rows)
+    assert "give --delimiter, or --skip" in nisus.refuses("log", str(tmp_path / "a.csv"))
+    given = ["--log", str(tmp_path / "a.csv"), "--delimiter", "^", "--heading", "4"]
+    nisus("new", "plant", "--folder", str(tmp_path), *given)
+    source = yaml.safe_load((tmp_path / "plant.yaml").read_text())["source"]
+    assert (source["delimiter"], source["heading"], source["sensors"]) == ("^", 4, {"tt101": {"columns": "TT101"}})
+    assert nisus("fold", str(tmp_path / "plant.yaml"), "--json").json["twin"] == "plant"
+
+
 @pytest.mark.parametrize("command", ["log", "advise"])
 @pytest.mark.parametrize("name", ["folder", "folder.csv"])
-def test_a_folder_is_called_one(tmp_path, nisus, command, name):
+def test_a_folder_without_recordings_is_refused(tmp_path, nisus, command, name):
     (tmp_path / name).mkdir()
     said = nisus.refuses(command, str(tmp_path / name))
-    assert f"{name}: it is a folder; name " in said
+    assert f"{name}: holds no recording; name a file that ends in .csv" in said
 
 
 def test_a_draft_tells_which_column_and_unit_of_time_it_assumes(tmp_path, nisus):

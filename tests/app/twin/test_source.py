@@ -171,7 +171,7 @@ def test_what_is_no_channels_fault_is_not_blamed_on_one():
 
 
 def test_log_files_that_fit_nothing_are_one_line():
-    assert message(LOG, SourceError, log_files=["."]) == "--log .: it is a folder; name the files in it"
+    assert message(LOG, SourceError, log_files=["."]).startswith(".: holds no recording; name a file that ends in .csv")
     assert (
         message(LOG, SourceError, log_files=["absent.blf"]) == "--log absent.blf: there is no such file; check the path"
     )

@@ -83,6 +83,35 @@ def test_random_pieces_of_bytes_give_the_fold_of_the_whole_file(tmp_path, seed):
     assert_same(folded("kf", model, log).track, folded("kf", model, as_log(expected)).track)
 
 
+def test_a_preamble_and_units_are_waited_for_and_then_skipped(tmp_path):
+    """In pieces of 3 bytes, again after a restart, and the decimal sign from later rows."""
+    text = "Logger;7\nRate;2\nt;w\ns;degC\n" + "".join(f"{k};{40 + k}\n" for k in range(20)) + "20;1,5\n21;2,5\n"
+    said: list[str] = []
+    source = FollowedTable(
+        lambda: [tmp_path / "a.csv"] if (tmp_path / "a.csv").exists() else [],
+        time=TimeColumn("t [s]"),
+        channels=[Channel(READING, 0, "winding", ("w [degC]",))],
+        width=1,
+        report=lambda key, one: said.append(one),
+    )
+    found = []
+    for at in range(0, len(text), 3):
+        with (tmp_path / "a.csv").open("a") as file:
+            file.write(text[at : at + 3])
+        found.append(rest(source))
+    events = Events.concat(found, 1)
+    assert times(events) == [*range(22)] and events.value[:, 0].tolist() == [*range(40, 60), 1.5, 2.5]
+    assert [one for one in said if "left out" not in one] == ["a.csv: heading in line 3, units in line 4"]
+    again = FollowedTable(
+        lambda: [tmp_path / "a.csv"],
+        time=TimeColumn("t [s]"),
+        channels=[Channel(READING, 0, "winding", ("w [degC]",))],
+        width=1,
+    )
+    again.restore(source.numbers(source.mark))
+    assert times(rest(again)) == [*range(22)]
+
+
 def test_a_half_written_line_waits_for_its_end_and_what_comes_later_has_its_arrival(tmp_path, monkeypatch):
     monkeypatch.setattr(follow, "time", SimpleNamespace(time_ns=lambda: 77))
     path, source = tmp_path / "a.csv", followed(tmp_path)
