@@ -15,12 +15,13 @@ CAN_LOGS = (".asc", ".blf", ".csv", ".db", ".log", ".mf4", ".trc")  # Endings of
 
 EITHER = (".csv", ".txt")  # Endings of CAN logs and of tables, which their content tells apart
 
-TABLES = (".csv", ".parquet", ".pq", ".feather", ".arrow", ".mat", ".npz", ".mf4", ".mdf", ".dat")
+TABLES = (".csv", ".parquet", ".pq", ".feather", ".arrow", ".mat", ".npz")
 
 MDF = (".mf4", ".mdf", ".dat")  # Endings of ASAM MDF, which holds signals or frames of CAN
 
 EXTRAS = {
     ".mcap": "robotics", ".db3": "robotics", ".xlsx": "excel", ".xls": "excel", ".ods": "excel", ".tdms": "tdms",
+    ".mf4": "mf4", ".mdf": "mf4", ".dat": "mf4",
 }  # fmt: skip
 """Endings of tables that a bundled extension reads, which is named where it is missing."""
 
@@ -175,6 +176,21 @@ def refuse_others(path: Path, head: bytes) -> None:
             raise SourceError(f"{path}: is no table; it is {what}")
     if path.suffix.lower() in (".yaml", ".yml"):
         raise SourceError(f"{path}: is no table; it is YAML, as of a twin, whose recording nisus fold reads")
+
+
+def holds_signals(path: Path) -> bool:
+    """Return whether a file is MDF and holds no frames of CAN, by its blocks of text, which are never compressed."""
+    if not path.is_file():
+        return False  # It is reported when the file is read.
+    with path.open("rb") as file:
+        if file.read(4) not in (b"MDF ", b"UnFi"):
+            return False
+        overlap = b""
+        while part := file.read(2**24):
+            if b"CAN_DataFrame" in overlap + part:
+                return False
+            overlap = part[-16:]
+    return True
 
 
 UNREADABLE_ERRORS = (OSError, zipfile.BadZipFile, zlib.error, EOFError, NotImplementedError, RuntimeError)

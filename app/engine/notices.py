@@ -10,12 +10,13 @@ from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass, replace
 
 from estimators.errors import ConfigError, printable, quoted
+from sources.tables.text import READ_AS
 
 LINE_PERIOD_S = 1.0
 """Seconds between two lines under one key; those in between are only counted, so that a flood stays readable."""
 
-EXPECTED = ("condition ", "repeats ")
-"""Keys of readings that are left out as the twin's YAML has it."""
+EXPECTED = ("condition ", "repeats ", READ_AS)
+"""Keys of readings that are left out as the twin's YAML has it, and of what was assumed about a format."""
 
 MAX_LINES = 1000
 

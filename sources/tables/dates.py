@@ -49,20 +49,10 @@ _IGNORED = frozenset(
 )
 """Days of the week, which say nothing that the date does not, and words between date and clock."""
 
-_ZONES = {
-    **dict.fromkeys(("z", "utc", "gmt", "ut", "wet"), 0),
-    **dict.fromkeys(("cet", "mez", "west"), 60),
-    **dict.fromkeys(("cest", "mesz", "eet"), 120),
-    "eest": 180,
-    "jst": 540,
-    "edt": -240,
-    "est": -300,
-    "cdt": -300,
-    "mdt": -360,
-    "mst": -420,
-    "pdt": -420,
-    "pst": -480,
-}
+_ZONES = dict(
+    z=0, utc=0, gmt=0, ut=0, wet=0, west=60, cet=60, mez=60, cest=120, mesz=120, eet=120, eest=180, jst=540,
+    edt=-240, est=-300, cdt=-300, mdt=-360, mst=-420, pdt=-420, pst=-480,
+)  # fmt: skip
 """Minutes by which zones are ahead of UTC. CST, IST and BST each name several zones."""
 
 _CLOCK = (

@@ -76,11 +76,8 @@ def format_of(path: Path) -> TableFormat | None:
         SourceError: If its extension is missing.
     """
     suffix = formats.suffix_of(path)
-    if suffix in formats.MDF:
-        from .mdf import holds_signals, mdf_names, read_mdf  # Here, not above: it imports python-can.
-
-        if holds_signals(path):
-            return TableFormat(mdf_names, read_mdf, sparse=True)
+    if suffix in formats.MDF and not formats.holds_signals(path):
+        return None
     if suffix in _FORMATS:
         return _FORMATS[suffix]
     if suffix in (found := formats.added("tables")):

@@ -16,12 +16,12 @@ from typing import TYPE_CHECKING, NamedTuple
 import numpy as np
 
 from estimators.errors import SourceError
-
-from ..can import check_mf4
-from ..can.mf4 import lost_records, opened, start_of
-from ..source import TRUNCATED
-from ..worker_process import gist
-from .text import CHUNK_ROWS, UNREADABLE, Chunk, Column, Problem
+from sources.can import check_mf4
+from sources.can.mf4 import lost_records, opened, start_of
+from sources.source import TRUNCATED
+from sources.tables.rows import TableFormat
+from sources.tables.text import CHUNK_ROWS, UNREADABLE, Chunk, Column, Problem
+from sources.worker_process import gist
 
 if TYPE_CHECKING:
     from asammdf import MDF
@@ -134,16 +134,4 @@ def _values(mdf: MDF, place: _Place) -> np.ndarray:
     return values
 
 
-def holds_signals(path: Path) -> bool:
-    """Return whether a file is MDF and holds no frames of CAN, by its blocks of text, which are never compressed."""
-    if not path.is_file():
-        return False  # It is reported when the file is read.
-    with path.open("rb") as file:
-        if file.read(4) not in (b"MDF ", b"UnFi"):
-            return False
-        overlap = b""
-        while part := file.read(2**24):
-            if b"CAN_DataFrame" in overlap + part:
-                return False
-            overlap = part[-16:]
-    return True
+SIGNALS = TableFormat(mdf_names, read_mdf, sparse=True)
