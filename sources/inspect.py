@@ -510,7 +510,7 @@ def _time_of(path: Path, names: Sequence[str], time: TimeColumn, dialect: Dialec
                 return name
     if like is not None:
         return like
-    rows = [row, *islice(cells, MAX_TEXTS)]
+    rows = [one for one in (row, *islice(cells, MAX_TEXTS)) if len(one) == len(names)]
     return next((name for k, name in enumerate(names) if _since_1970([cell[k] for cell in rows])), None)
 
 

@@ -140,7 +140,10 @@ def rows_of(
     """
     form = format_of(path)
     if form is None:
-        yield from read_rows(path, time, columns, form, dialect)
+        try:
+            yield from read_rows(path, time, columns, form, dialect)
+        except SourceError as error:
+            raise error if str(path) in str(error) else SourceError(f"{path}: {error}") from None
         return
     reader = IsolatedReader(read_rows, path, time, columns, form, dialect)
     try:
