@@ -42,7 +42,7 @@ class Recordings {
   draw({ folder, files }) {
     this.looking = files.some((file) => file.looking);
     if (!changed(this.list, files)) return;
-    setText(this.where, `Kept in ${folder}. Record one on a twin's page (R), or drop a recording, a log (CSV, Parquet, MF4, BLF, ASC, candump, MAT, NPZ, MCAP) or a DBC here.`);
+    setText(this.where, `Kept in ${folder}. Record one on a twin's page (R), or drop a recording, a log (CSV, Excel, Parquet, MF4, TDMS, BLF, ASC, candump, MAT, NPZ, MCAP, or a ZIP of these) or a DBC here.`);
     // What is asked of one file stays asked while the list is drawn anew.
     const asked = this.list.querySelector("[data-asked]")?.dataset.name;
     this.list.replaceChildren(...files.map((file) => this.item(file)));
