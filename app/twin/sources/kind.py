@@ -10,6 +10,8 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, TypeVar
 
+import platformdirs
+
 from config.loader import Loaded, shown_path
 from config.source_schema import CanLogSection, CanSection, RecordingSection, TableSection
 from config.yaml_files import Key, dotted
@@ -202,8 +204,7 @@ def _beside(loaded: Loaded, path: Path) -> Path:
 
 def recordings_folder() -> Path:
     """Return the folder of recordings that belong to no YAML: NISUS_DATA, or one in the user's cache."""
-    cache = Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache")
-    return Path(os.environ.get(DATA) or cache / "nisus" / "recordings")
+    return Path(os.environ.get(DATA) or platformdirs.user_cache_path("nisus") / "recordings")
 
 
 def _root(loaded: Loaded, section: CanSection | RecordingSection) -> Path:

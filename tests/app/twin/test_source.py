@@ -100,7 +100,7 @@ def test_nisus_data_replaces_the_folder(monkeypatch):
 
 
 def test_a_recording_that_others_can_get_is_in_the_users_cache(monkeypatch):
-    monkeypatch.setenv("XDG_CACHE_HOME", "cache")
+    monkeypatch.setenv("XDG_CACHE_HOME", str(Path("cache").absolute()))
     Path("cache/nisus").mkdir(parents=True)
     Path("data").rename("cache/nisus/recordings")
     assert len(of(events(twin_of(LOG)), READING)) == 3
