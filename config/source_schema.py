@@ -231,7 +231,7 @@ class TimeColumnSection(Section):
         BeforeValidator(as_list, json_schema_input_type=str | list[str]),
     ]
     """Its name; or, of a CSV, the columns of date and clock: [Date, Clock]."""
-    unit: Literal["s", "ms", "us", "ns", "min", "h", "excel", "matlab"] = "s"
+    unit: Literal["s", "ms", "us", "ns", "min", "h", "d", "excel", "matlab"] = "s"
     """Its unit, if it holds numbers; excel and matlab count days, as serial dates do there. Default: s."""
     format: Text | None = None
     """Format of its dates, as in Python's strptime: "%m/%d/%Y %H:%M:%S". Default: null, detected."""

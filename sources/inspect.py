@@ -38,6 +38,21 @@ MIN_GAP_S = 1.0
 MIN_GAP_INTERVALS = 20.0
 """Seconds, or median intervals if they are longer, from which on a pause is a gap."""
 
+TIME_UNITS = {
+    spelling: unit
+    for unit, spellings in {
+        "s": "s sec secs second seconds sekunden",
+        "ms": "ms msec millis milliseconds",
+        "us": "us µs μs usec micros microseconds",
+        "ns": "ns nsec nanos nanoseconds",
+        "min": "min mins minute minutes minuten",
+        "h": "h hr hrs hour hours std stunden",
+        "d": "d day days tage",
+    }.items()
+    for spelling in spellings.split()
+}
+"""Units of time by their spellings in a heading."""
+
 QUALITY = re.compile(r"qual|valid|güte", re.IGNORECASE)
 GOOD_WORD = re.compile(r"good\b.*|ok|valid|normal|gut", re.IGNORECASE)
 OPC_GOOD = 192
@@ -332,8 +347,8 @@ def _tables(files: list[Path], time: TimeColumn, dialect: Dialect) -> RecordingC
         )
     time = _with_clock(files[0], names, time._replace(name=chosen), dialect)
     chosen = time.name
-    named = heading_unit(chosen) or chosen.rpartition("_")[2]
-    if time.unit == "s" and named in ("ms", "us", "ns", "min", "h"):
+    named = TIME_UNITS.get(re.split(r"[\[(/_]", chosen.lower().rstrip(" )]"))[-1].strip())
+    if time.unit == "s" and named is not None:
         time = time._replace(unit=named)
     faults = remarks_of(files, dialect)
     copies = [name for name, count in Counter(names).items() if count > 1]
@@ -369,7 +384,7 @@ def _tables(files: list[Path], time: TimeColumn, dialect: Dialect) -> RecordingC
             if undated
             else f"{files[0]}: it has a header and no rows; record it again"
         )
-        raise SourceError("; ".join(faults) or none)
+        raise SourceError("; ".join([*faults, none] if undated else faults or [none]))
     if undated:
         more = f"; so are {len(undated) - 1} more rows" if len(undated) > 1 else ""
         faults.append(undated[0] + more)
@@ -496,9 +511,10 @@ def _rows(
 
 def _time_of(path: Path, names: Sequence[str], time: TimeColumn, dialect: Dialect) -> str | None:
     """Return the time column, by its name, as the first one of dates, or as the first that counts from 1970."""
-    last = {name.lower().rpartition(".")[2].partition("[")[0].strip(): name for name in reversed(names)}
+    able = [name for name in names if (heading_unit(name) or "s").lower() in TIME_UNITS]  # T [°C] is none.
+    last = {_bare(name): name for name in reversed(able)}
     named = next((last[name] for name in TIME_NAMES if name in last), None)
-    like = next((name for name in names if TIME_NAME.search(name)), None)
+    like = next((name for name in able if TIME_NAME.search(name)), None)
     if named is not None or (cells := cells_of(path, dialect)) is None:
         return named or like
     row = next(cells, [])
@@ -512,6 +528,13 @@ def _time_of(path: Path, names: Sequence[str], time: TimeColumn, dialect: Dialec
         return like
     rows = [one for one in (row, *islice(cells, MAX_TEXTS)) if len(one) == len(names)]
     return next((name for k, name in enumerate(names) if _since_1970([cell[k] for cell in rows])), None)
+
+
+def _bare(name: str) -> str:
+    """Return the name of a column without its path and its unit of time."""
+    text = re.split(r"[\[(/]", name.lower().rpartition(".")[2])[0].strip()
+    base, _, unit = text.rpartition("_")
+    return base if base and unit in TIME_UNITS else text
 
 
 def _since_1970(cells: list[str]) -> bool:

@@ -7,6 +7,7 @@ without one are checked by the fold.
 from __future__ import annotations
 
 from functools import lru_cache
+from threading import Lock
 
 import numpy as np
 from numba import types
@@ -84,11 +85,16 @@ def _look(t, kind, channel, value, width, rows, nu, nx):
     return 0, FINE, infinite
 
 
+_compiling = Lock()
+
+
 @lru_cache(maxsize=1)
 def _looking() -> CPUDispatcher:
     """Return `_look`, compiled for its only signature, which also accepts writable arrays."""
-    _look.compile(_signature.args)
-    _look.disable_compile()
+    with _compiling:  # The cache has no lock.
+        if not _look.signatures:
+            _look.compile(_signature.args)
+            _look.disable_compile()
     return _look
 
 

@@ -33,10 +33,10 @@ QUALITY_WORD = re.compile(
 """Words by which historians, OPC servers and spreadsheets mark a value that there is not."""
 
 TIME_NAMES = (
-    "t", "ts", "time", "timestamp", "seconds", "time_s", "t_s", "date", "datetime", "unix_time", "elapsed", "zeit",
+    "time", "timestamp", "t", "ts", "seconds", "time_s", "t_s", "date", "datetime", "unix_time", "elapsed", "zeit",
     "zeitstempel", "datum", "horodatage", "fecha",
 )  # fmt: skip
-"""Usual names of a time column; otherwise the first one of dates is taken, or the first that is named like one."""
+"""Usual names of a time column, the surest first; else the first of dates, or the first that is named like one."""
 
 TIME_NAME = re.compile(r"^t[_ ]|time|epoch|zeit|datum", re.IGNORECASE)
 

@@ -23,7 +23,7 @@ if TYPE_CHECKING:
 
 DAY_NS = 86_400 * 10**9
 
-UNITS = {"s": 10**9, "ms": 10**6, "us": 10**3, "ns": 1, "min": 60 * 10**9, "h": 3600 * 10**9}
+UNITS = {"s": 10**9, "ms": 10**6, "us": 10**3, "ns": 1, "min": 60 * 10**9, "h": 3600 * 10**9, "d": DAY_NS}
 """Nanoseconds of each unit of time."""
 
 SERIAL_DAYS = {"excel": 25_569, "matlab": 719_529}
@@ -304,9 +304,13 @@ def _day_and_month(name: str, cells: Sequence[str]) -> str:
         unclear = unclear or cell
     if unclear is None:
         return "day"
-    separator, year = unclear.lstrip("0123456789")[0], "%y" if layout(unclear).digits == 2 else "%Y"  # type: ignore[union-attr]
+    found = layout(unclear)
+    assert found is not None
+    separator, year = unclear.lstrip("0123456789")[0], "%y" if found.digits == 2 else "%Y"
     day, month = (separator.join(order) for order in (("%d", "%m", year), ("%m", "%d", year)))
-    clock = " %H:%M:%S" if unclear.count(":") == 2 else " %H:%M" if ":" in unclear else ""
+    directives = iter(("%I" if found.half else "%H", "%M", "%S", "%f"))
+    _, rest = re.split(r"^\d+\D+\d+\D+\d+", unclear)
+    clock = re.sub(r"[AP]M", "%p", re.sub(r"\d+", lambda _: next(directives), rest, count=len(found.clock)), flags=re.I)
     raise SourceError(
         f"{name} is {quoted(unclear)}, which may be day{separator}month or month{separator}day; set the time's format "
         f'(time.format, --time-format): "{day}{clock}" or "{month}{clock}"'

@@ -247,13 +247,13 @@ def _moving(item: Moves, k: int, inputs: Sequence[str], first: int) -> list[str]
 
 
 def _parameters(item: Moves) -> list[str]:
-    """Time constant, offset and gains of a lag."""
+    """Time constant, value without inputs, and gains of a lag."""
     if item.lag is None:
         return []
     unit = item.signal.series.unit
     return [
         f'        Parameter({_text(f"{item.name}_lag")}, "s", {item.lag.tau:.4g}, low={item.lag.tau / 100.0:.3g}),',
-        f"        Parameter({_text(f'{item.name}_offset')}, {_text(unit)}, {item.lag.offset:.6g}),",
+        f"        Parameter({_text(f'{item.name}_base')}, {_text(unit)}, {item.lag.offset:.6g}),",
         *(
             f'        Parameter({_text(f"{item.name}_per_{each}")}, "", {gain:.6g}),'
             for each, gain in zip(item.inputs, item.lag.gains, strict=True)

@@ -214,3 +214,37 @@ def test_a_draft_tells_which_column_and_unit_of_time_it_assumes(tmp_path, nisus)
     assert 'time: {column: "stamp_1", unit: ms}' in (tmp_path / "made.yaml").read_text()
     folded = nisus("fold", str(tmp_path / "made.yaml"))
     assert "taken as" not in folded.err
+
+
+@pytest.mark.parametrize(
+    ("heading", "step", "unit"),
+    [
+        ("Time,T [°C]", "10", "s"),
+        ("time,T", "10", "s"),
+        ("T [degC],Time [s]", "10", "s"),
+        ("Zeit/min,T [°C]", "0.5", "min"),
+        ("Time (days),T [°C]", "0.25", "d"),
+        ("Elapsed (hours),T [°C]", "0.25", "h"),
+        ("time_ms,T", "10", "ms"),
+    ],
+)
+def test_the_time_and_its_unit_are_those_of_the_heading(tmp_path, nisus, heading, step, unit):
+    """A temperature T is no time, and a unit of time may follow a slash or stand in brackets."""
+    rows = [(f"{k * float(step):g}", str(20 + k % 7)) for k in range(40)]
+    rows = [row[::-1] if heading.startswith("T [") else row for row in rows]
+    (tmp_path / "a.csv").write_text("\n".join([heading, *map(",".join, rows)]) + "\n", encoding="utf-8")
+    found = nisus("log", str(tmp_path / "a.csv"), "--json").json
+    seconds = {"s": 1, "ms": 1e-3, "min": 60, "h": 3600, "d": 86_400}[unit]
+    assert found["end_ns"] - found["start_ns"] == round(39 * float(step) * seconds * 1e9)
+    assert [one["name"][0] for one in found["columns"]] == ["T"]
+
+
+def test_a_format_that_fits_no_row_is_refused_also_after_a_remark(tmp_path, nisus):
+    (tmp_path / "a.csv").write_text("Plant 7\ntime,x\n" + "".join(f"03/05/26 08:00:{k:02} AM,{k}\n" for k in range(50)))
+    said = nisus.refuses("log", str(tmp_path / "a.csv"))
+    assert said.endswith('(time.format, --time-format): "%d/%m/%y %I:%M:%S %p" or "%m/%d/%y %I:%M:%S %p"')
+    assert "heading in line 2; no row has a time; a.csv:3: time is '03/05/26 08:00:00 AM'" in nisus.refuses(
+        "log", str(tmp_path / "a.csv"), "--time-format", "%m/%d/%y %H:%M:%S"
+    )
+    read = nisus("log", str(tmp_path / "a.csv"), "--time-format", "%m/%d/%y %I:%M:%S %p", "--json").json
+    assert read["start_ns"] == 1_772_697_600 * 10**9  # date -u -d 2026-03-05T08:00 +%s

@@ -1,6 +1,8 @@
 """Checks of the log on entry: what no model has a place for is refused, and the log stays as it was."""
 
 import json
+import subprocess
+import sys
 
 import numpy as np
 import pytest
@@ -12,6 +14,7 @@ from estimators.model.state_space import Input, Noise, Row, Sensor, State, State
 from estimators.models import MODELS
 from estimators.snapshots import Base
 from estimators.tuning import Tuning
+from tests import ROOT
 from tests.cases import cases
 from tests.models import first_state, first_states
 from tests.support import SECOND
@@ -198,3 +201,17 @@ def test_a_base_of_another_model_has_a_state_of_another_size():
     base = Base(np.zeros(2), np.eye(2), 0, np.zeros(1), "ekf", np.zeros(99))
     growing = Fold("ekf", TWO, Tuning.of(TWO), Log.of(TWO), base=base)
     np.testing.assert_array_equal(growing.moments()[1], np.eye(2))
+
+
+def test_two_threads_may_be_the_first_to_check_a_batch():
+    """In a process of its own, as the check is compiled once."""
+    code = (
+        "import threading; from estimators.events.checks import _looking\n"
+        "both, found = threading.Barrier(2), []\n"
+        "def look(): both.wait(); found.append(_looking())\n"
+        "threads = [threading.Thread(target=look) for _ in range(2)]\n"
+        "[thread.start() for thread in threads]; [thread.join() for thread in threads]\n"
+        "assert len(found) == 2, found"
+    )
+    done = subprocess.run([sys.executable, "-c", code], cwd=ROOT, capture_output=True, text=True, check=False)
+    assert (done.returncode, done.stderr) == (0, "")

@@ -105,3 +105,19 @@ def test_the_months_of_a_two_digit_year_are_told_by_its_formats():
     with pytest.raises(SourceError, match='"%d/%m/%y %H:%M" or "%m/%d/%y %H:%M"'):
         read("3/4/24 8:00")
     assert read("3/4/24 8:00", format="%m/%d/%y %H:%M") == [1_709_539_200 * 10**9]
+
+
+@pytest.mark.parametrize(
+    ("cell", "form"),
+    [
+        ("03/05/2026 08:00:00:000", "%d/%m/%Y %H:%M:%S:%f"),
+        ("03-05-26 8:00:00.5 pm", "%d-%m-%y %I:%M:%S.%f %p"),
+        ("03/05/2026", "%d/%m/%Y"),
+    ],
+)
+def test_the_formats_that_are_offered_read_the_cell(cell, form):
+    from estimators.errors import SourceError
+
+    with pytest.raises(SourceError, match=f'"{form}" or '):
+        read(cell)
+    assert read(cell, format=form) != [None]

@@ -178,3 +178,17 @@ def test_a_long_recording_is_checked_in_windows():
     )
     assert check.sensors[0].n == 8 * 12_500
     assert check.sensors[0].coverage.value == pytest.approx(0.95, abs=0.005)
+
+
+def test_a_coarse_sensor_of_a_state_that_follows_an_input_has_an_offset_beside_the_lag(tmp_path, nisus):
+    rng = np.random.default_rng(5)
+    power = np.where(np.arange(N) // 300 % 2, 100.0, 20.0)
+    wall = np.zeros(N)
+    for k in range(1, N):
+        wall[k] = wall[k - 1] + (20.0 + 0.3 * power[k - 1] - wall[k - 1]) / 60.0
+    wall = np.round(wall + rng.normal(0, 0.02, N), 1)
+    log = write(tmp_path / "wall.csv", wall=wall, power=power)
+    nisus("new", "plant", "--folder", tmp_path, "--log", str(log), "--sensors", "wall", "--inputs", "power")
+    assert "wall_base" in (tmp_path / "plant.py").read_text()
+    assert "offset: {std: 0.1}" in (tmp_path / "plant.yaml").read_text()
+    assert nisus("fold", tmp_path / "plant.yaml", "--json").json["readings"] == N
