@@ -21,7 +21,7 @@ from . import sockets
 from .database import load_database
 from .ids import KnownIds, MessageIds, sender
 from .limits import SignalLimits, span_of
-from .readers import EXTENDED, GROUP, GROUP_BITS, BusName, Raw, group_of
+from .readers import EXTENDED, GROUP, BusName, Raw, group_bits, group_of
 from .signals import extract, ordered, tabulate, vectorises
 from .transport import TRANSPORT, Transport
 
@@ -131,7 +131,7 @@ class Decoder:
         return [
             {
                 "can_id": key & ~(EXTENDED | GROUP),
-                "can_mask": _mask(key) if key & GROUP else 0x1FFFFFFF if key & EXTENDED else 0x7FF,
+                "can_mask": group_bits(key) if key & GROUP else 0x1FFFFFFF if key & EXTENDED else 0x7FF,
                 "extended": bool(key & EXTENDED),
             }
             for key in sorted(self.wanted)
@@ -366,11 +366,6 @@ def _as_j1939(message: Message) -> Message:
     message = copy(message)
     message.protocol = "j1939"
     return message
-
-
-def _mask(group: int) -> int:
-    """Return the bits of an id that name its parameter group."""
-    return GROUP_BITS[group >> 16 & 0xFF >= 240] & ~EXTENDED
 
 
 def same_bus(wanted: BusName, actual: BusName) -> bool:

@@ -13,7 +13,7 @@ from contextlib import suppress
 from io import TextIOWrapper
 from itertools import islice
 from pathlib import Path
-from typing import NamedTuple
+from typing import NamedTuple, TypeVar
 
 import can
 import numpy as np
@@ -317,7 +317,7 @@ def _selected(
     codes, counts = np.unique((block.bus << 32) + block.key, return_counts=True)
     for code, count in zip(codes.tolist(), counts.tolist(), strict=True):
         seen[code >> 32, code & 0xFFFFFFFF] += count
-    rows = np.arange(block.key.size) if wanted is None else np.flatnonzero(is_wanted(block.key, wanted))
+    rows = wanted_rows(block.key, wanted)
     numbers, inverse = np.unique(block.bus[rows], return_inverse=True)
     places = np.array([buses.setdefault(number, len(buses)) for number in numbers.tolist()], np.int64)
     data = np.zeros((rows.size, longest), np.uint8)
@@ -353,23 +353,29 @@ EXTENDED = 1 << 31
 GROUP = 1 << 30
 """Added to a parameter group of J1939 in place of an id: priority and addresses are zero."""
 
-GROUP_BITS = 0x83FF0000, 0x83FFFF00
-"""Bits of an id that name its parameter group: of formats below 240, whose next byte is an address, and of others."""
+Ids = TypeVar("Ids", int, np.ndarray)
+"""An id, or several."""
 
 
-def group_of(key: int) -> int:
+def group_bits(key: Ids) -> Ids:
+    """Return the bits of an id that name its parameter group; below format 240 the next byte is an address."""
+    return 0x3FF0000 | 0xFF00 * (key >> 16 & 0xFF >= 240)
+
+
+def group_of(key: Ids) -> Ids:
     """Return the parameter group of an id with EXTENDED; of any other id a number that no wanted one has."""
-    return key & GROUP_BITS[key >> 16 & 0xFF >= 240] | GROUP
+    return key & (EXTENDED | group_bits(key)) | GROUP
 
 
-def is_wanted(key: np.ndarray, wanted: frozenset[int]) -> np.ndarray:
-    """Return which ids (n,) are wanted, by themselves or by their parameter group."""
+def wanted_rows(key: np.ndarray, wanted: frozenset[int] | None) -> np.ndarray:
+    """Return the places of the ids (n,) that are wanted, by themselves or by their parameter group; None is all."""
+    if wanted is None:
+        return np.arange(key.size)
     listed = list(wanted)
     found = np.isin(key, listed)
     if any(item & GROUP for item in listed):
-        groups = np.where(key >> 16 & 0xFF >= 240, key & GROUP_BITS[1], key & GROUP_BITS[0]) | GROUP
-        found |= np.isin(groups, listed)
-    return found
+        found |= np.isin(group_of(key), listed)
+    return np.flatnonzero(found)
 
 
 CHUNK_FRAMES = 8192  # Frames of a chunk
