@@ -13,7 +13,7 @@ import logging
 import struct
 import sys
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import closing, contextmanager
 from io import BytesIO
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -21,7 +21,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from ..worker_process import gist
-from .readers import CHUNK_FRAMES, EXTENDED, BusName, LogSummary, Raw, is_wanted, unreadable
+from .readers import CHUNK_FRAMES, EXTENDED, BusName, LogSummary, Raw, unreadable, wanted_rows
 
 if TYPE_CHECKING:
     from asammdf import MDF, Signal
@@ -49,28 +49,22 @@ def opened(path: Path) -> Iterator[tuple[MDF, bytes]]:
     Raises:
         SourceError: If nothing can be read.
     """
-    with _quiet():
-        mdf, content = _open(path)
-        try:
-            yield mdf, content.getvalue()
-        finally:
-            mdf.close()
-
-
-def _open(path: Path) -> tuple[MDF, BytesIO]:
     from asammdf import MDF  # Here, not above: it takes long, and most logs have other formats.
 
     # From memory: asammdf completes an unfinished file (a logger that lost power) in place.
-    content = BytesIO(path.read_bytes())
-    try:
-        return MDF(content), content
-    except MemoryError:
-        raise
-    except Exception as error:  # noqa: BLE001  a damaged file makes asammdf raise anything
-        fault = unreadable(path, error)
-    # A partly opened file prints messages when it is released; do that here, where they are suppressed.
-    gc.collect()
-    raise fault
+    content, fault = BytesIO(path.read_bytes()), None
+    with _quiet():
+        try:
+            mdf = MDF(content)
+        except MemoryError:
+            raise
+        except Exception as error:  # noqa: BLE001  a damaged file makes asammdf raise anything
+            fault = unreadable(path, error)
+        if fault:
+            gc.collect()  # A partly opened file prints messages when it is released.
+            raise fault
+        with closing(mdf):
+            yield mdf, content.getvalue()
 
 
 def read_mf4(path: Path, wanted: frozenset[int] | None, longest: int) -> Iterator[Raw | LogSummary]:
@@ -172,7 +166,7 @@ def _columns(signal: Signal, start: int, wanted: frozenset[int] | None, longest:
     if extended is not None:
         key |= np.where(np.asarray(extended, np.int64) != 0, EXTENDED, 0)
     bus = np.full(key.size, NO_BUS) if buses is None else np.asarray(buses, np.int64)
-    rows = np.arange(key.size) if wanted is None else np.flatnonzero(is_wanted(key, wanted))
+    rows = wanted_rows(key, wanted)
     data = np.zeros((rows.size, longest), np.uint8)
     given = np.asarray(column("DataBytes"))
     if given.ndim == 2:

@@ -182,16 +182,13 @@ class Encoder:
         # By an event's kind and index: its frame and, for each row, signal, slope, offset and range of the conversion.
         self._routes: dict[tuple[int, int], tuple[_Frame, list[tuple[str, float, float, float, float]]]] = {}
         for channel in channels:
-            if channel.convert is not None:
-                raise SourceError(
-                    f"{channel.name}: convert is {channel.convert}; it cannot be encoded, so leave it out"
-                )
-            if channel.only:
-                raise SourceError(f"{channel.name}: only picks frames; it cannot be encoded, so leave it out")
-            if channel.accuracy is not None:
-                raise SourceError(
-                    f"{channel.name}: accuracy comes from the asset; it cannot be encoded, so leave it out"
-                )
+            for given, text in (
+                (channel.convert, f"convert is {channel.convert}"),
+                (channel.only, "only picks frames"),
+                (channel.accuracy, "accuracy comes from the asset"),
+            ):
+                if given:
+                    raise SourceError(f"{channel.name}: {text}; it cannot be encoded, so leave it out")
             messages, _, path = find_messages(databases, channel)
             message = messages[0]
             if any(signal.multiplexer_ids for signal in message.signals):
