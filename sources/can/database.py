@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import logging
 import re
+from contextlib import suppress
 from functools import lru_cache
 from pathlib import Path
 
@@ -15,11 +16,10 @@ from estimators.errors import SourceError
 from ..worker_process import gist
 from .ids import NULL_ADDRESS
 
-DOUBLE_BYTES = re.compile(rb"[\x81-\xfe][\x40-\x7e\x80-\xfe]")
-USUAL_DOUBLE = re.compile(rb"[\xa1-\xa3\xb0-\xd7][\xa1-\xfe]")
-"""Characters of two bytes in GB18030, and its usual ones: the signs and the first level of GB2312."""
+USUAL = re.compile(rb"[\xa1-\xa3\xb0-\xd7][\xa1-\xfe]")
+"""Usual characters of GB18030: the signs and the first level of GB2312."""
 
-MIN_USUAL = 0.5  # Share of usual ones among them from which on a DBC is in Chinese
+MIN_USUAL = 0.5  # Share of usual ones among those beyond ASCII from which on a DBC is in Chinese
 
 
 def load_database(path: Path) -> Database:
@@ -61,15 +61,13 @@ def encoding_of(content: bytes) -> str:
 
     In a text of Windows-1252, such as `°C` or `Größe`, two bytes beyond ASCII are rarely a usual Chinese character.
     """
-    for encoding in ("utf-8-sig", "gb18030"):
-        try:
-            content.decode(encoding)
-        except UnicodeDecodeError:
-            continue
-        pairs = DOUBLE_BYTES.findall(content)
-        usual = sum(USUAL_DOUBLE.fullmatch(pair) is not None for pair in pairs)
-        if encoding != "gb18030" or usual >= MIN_USUAL * len(pairs):
-            return encoding
+    with suppress(UnicodeDecodeError):
+        content.decode("utf-8-sig")
+        return "utf-8-sig"
+    with suppress(UnicodeDecodeError):
+        signs = [sign.encode("gb18030") for sign in content.decode("gb18030") if sign > "\x7f"]
+        if sum(USUAL.fullmatch(sign) is not None for sign in signs) >= MIN_USUAL * len(signs):
+            return "gb18030"
     return "cp1252"
 
 
