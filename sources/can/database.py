@@ -37,17 +37,13 @@ def load_database(path: Path) -> Database:
 
 @lru_cache(maxsize=16)
 def _load(path: Path, stamp: int) -> Database:
-    logger = logging.getLogger("cantools")
-    level = logger.level
-    logger.setLevel(logging.ERROR)  # It warns of duplicate names, which are harmless.
+    logging.getLogger("cantools").setLevel(logging.ERROR)  # It warns of duplicate names, which are harmless.
     try:
         # Not strict: signals of DBC files in use overlap, which is harmless where they are not read.
         encoding = encoding_of(path.read_bytes()) if path.suffix.lower() == ".dbc" else None
         database = cantools.database.load_file(path, encoding=encoding, strict=False)
     except (cantools.database.UnsupportedDatabaseFormatError, cantools.database.Error, OSError, ValueError) as error:
         raise SourceError(f"{path}: it cannot be read as a DBC ({gist(error)}); check that it is one") from None
-    finally:
-        logger.setLevel(level)
     if not isinstance(database, Database):
         raise SourceError(f"{path}: it describes no CAN messages; give a DBC")
     protocol = database.dbc.attributes.get("ProtocolType") if database.dbc is not None else None

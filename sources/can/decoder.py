@@ -19,7 +19,7 @@ from ..source import NEVER, Channel, Report, ignore
 from ..units import declared_conversion, second_ns
 from . import sockets
 from .database import load_database
-from .ids import KnownIds, MessageIds, sender
+from .ids import KnownIds, MessageIds, sender, shown_id
 from .limits import SignalLimits, span_of
 from .readers import EXTENDED, GROUP, BusName, Raw, group_bits, group_of
 from .signals import extract, ordered, tabulate, vectorises
@@ -69,11 +69,14 @@ class Decoder:
             messages, bus, path = find_messages(databases, channel)
             for message in messages:
                 grouped.setdefault((id(message), channel.source), (message, bus, path, []))[3].append(channel)
-        self._ids = [known.ids(message, source) for (_, source), (message, *_) in zip(grouped, grouped.values())]
-        self._plans = [
-            (_as_j1939(message) if ids.j1939 else message, *others)
-            for ids, (message, *others) in zip(self._ids, grouped.values(), strict=True)
-        ]
+        self._ids: list[MessageIds] = []
+        self._plans: list[tuple[Message, BusName, Path, list[Channel]]] = []
+        for (_, source), (message, *others) in grouped.items():
+            ids = known.ids(message, source)
+            own = copy(message)
+            own.protocol = "j1939" if ids.j1939 else message.protocol  # with its codes for missing values
+            self._ids.append(ids)
+            self._plans.append((own, *others))
         self._check_unique()
         self.wanted = frozenset(ids.wanted for ids in self._ids)
         """Ids of the frames that some channel needs, EXTENDED added, or parameter groups of J1939 (`group_of`)."""
@@ -327,11 +330,6 @@ class Expected(NamedTuple):
     period: float
 
 
-def shown_id(key: int) -> str:
-    """Return an id as text: 0x7e8, or 0x18fef100x of an extended frame."""
-    return f"{key & ~EXTENDED:#x}{'x' if key & EXTENDED else ''}"
-
-
 def _nearest_match(item: Expected, seen: FrameCounts) -> str:
     """Describe the nearest match of a missing message: its id on another bus, near ids, or the buses."""
     if not seen:
@@ -357,15 +355,6 @@ def _nearest_match(item: Expected, seen: FrameCounts) -> str:
 def _list(buses: Sequence[BusName]) -> str:
     shown = ", ".join("without a name" if bus is None else str(bus) for bus in buses[:MAX_NAMED_IDS])
     return shown + (", ..." if len(buses) > MAX_NAMED_IDS else "")
-
-
-def _as_j1939(message: Message) -> Message:
-    """Return a message with the codes of J1939 for missing values."""
-    if message.protocol == "j1939":
-        return message
-    message = copy(message)
-    message.protocol = "j1939"
-    return message
 
 
 def same_bus(wanted: BusName, actual: BusName) -> bool:

@@ -29,20 +29,6 @@ if TYPE_CHECKING:
 
 
 @contextmanager
-def _quiet() -> Iterator[None]:
-    """Suppress messages of asammdf when a partly opened file is released."""
-    logger, hook = logging.getLogger("asammdf"), sys.unraisablehook
-    level = logger.level
-    logger.setLevel(logging.CRITICAL + 1)
-    sys.unraisablehook = lambda _: None
-    try:
-        yield
-    finally:
-        sys.unraisablehook = hook
-        logger.setLevel(level)
-
-
-@contextmanager
 def opened(path: Path) -> Iterator[tuple[MDF, bytes]]:
     """Open a file: it and its bytes, as asammdf completes them; its messages are suppressed.
 
@@ -53,7 +39,9 @@ def opened(path: Path) -> Iterator[tuple[MDF, bytes]]:
 
     # From memory: asammdf completes an unfinished file (a logger that lost power) in place.
     content, fault = BytesIO(path.read_bytes()), None
-    with _quiet():
+    logging.getLogger("asammdf").setLevel(logging.CRITICAL + 1)
+    hook, sys.unraisablehook = sys.unraisablehook, lambda _: None
+    try:
         try:
             mdf = MDF(content)
         except MemoryError:
@@ -65,6 +53,8 @@ def opened(path: Path) -> Iterator[tuple[MDF, bytes]]:
             raise fault
         with closing(mdf):
             yield mdf, content.getvalue()
+    finally:
+        sys.unraisablehook = hook
 
 
 def read_mf4(path: Path, wanted: frozenset[int] | None, longest: int) -> Iterator[Raw | LogSummary]:

@@ -179,11 +179,9 @@ class CandumpLines:
         remedy = "record with candump -L"
         if None in found:
             raise SourceError(f"{path}: it is console output of candump without times; {remedy}, or with -ta")
-        if "-" in found[0]:
+        if "-" in found[0] or float(found[0]) > DATED_S:
             return
         times = np.array([float(text) for text in found])
-        if times[0] > DATED_S:
-            return
         # Differences rise and fall, or are all the same; times from the first frame rise, but for those of another bus.
         travel = float(np.abs(np.diff(times[1:])).sum())
         rise = float(times[-1] - times[1]) / travel if travel else 0.0

@@ -60,23 +60,19 @@ class Transport:
             t: Its time, ns.
             data: Its bytes.
         """
-        group = group_of(key)
-        if group not in TRANSPORT or len(data) < 8:
-            return None
-        source, destination = key & 0xFF, key >> 8 & 0xFF
-        pair = (bus, source, destination)
-        if group == MANAGEMENT:
+        group, pair = group_of(key), (bus, key & 0xFF, key >> 8 & 0xFF)
+        if group == MANAGEMENT and len(data) >= 8:
             self._manage(pair, key, t, data)
-            return None
-        session = self._open.get(pair)
+        session = self._open.get(pair) if group == TRANSFER and len(data) >= 8 else None
         if session is None:
             return None
-        late = t - session.last > TIMEOUTS_NS[destination == ALL]
-        if late or data[0] > session.count or (destination == ALL and data[0] != len(session.packets) + 1):
+        to_all, number = pair[2] == ALL, data[0]
+        late = t - session.last > TIMEOUTS_NS[to_all]
+        if late or not 1 <= number <= session.count or (to_all and number != len(session.packets) + 1):
             self._drop(pair)
             return None
         session.last = t
-        session.packets[data[0]] = data[1:8]
+        session.packets[number] = data[1:8]
         if len(session.packets) < session.count:
             return None
         del self._open[pair]
