@@ -9,7 +9,7 @@ from functools import lru_cache
 from pathlib import Path
 
 import cantools
-from cantools.database.can import Database, Message
+from cantools.database.can import Database
 
 from estimators.errors import SourceError
 
@@ -48,7 +48,13 @@ def _load(path: Path, stamp: int) -> Database:
         raise SourceError(f"{path}: it describes no CAN messages; give a DBC")
     protocol = database.dbc.attributes.get("ProtocolType") if database.dbc is not None else None
     formats = database.dbc is not None and "VFrameFormat" in database.dbc.attribute_definitions
-    _mark_j1939(database.messages, None if protocol is None or formats else str(protocol.value))
+    extended = [message for message in database.messages if message.is_extended_frame]
+    # By their form, ids are those of J1939 if their source is the null address, which is never that of a frame.
+    if (protocol is not None and protocol.value == "J1939" and not formats) or all(
+        message.frame_id & 0xFF == NULL_ADDRESS for message in extended
+    ):
+        for message in extended:
+            message.protocol = "j1939"
     return database
 
 
@@ -65,14 +71,3 @@ def encoding_of(content: bytes) -> str:
         if sum(USUAL.fullmatch(sign) is not None for sign in signs) >= MIN_USUAL * len(signs):
             return "gb18030"
     return "cp1252"
-
-
-def _mark_j1939(messages: list[Message], protocol: str | None) -> None:
-    """Mark the extended messages of a database as those of J1939, by its protocol or the form of its ids.
-
-    They have the form if their source is the null address, which is never that of a frame.
-    """
-    extended = [message for message in messages if message.is_extended_frame]
-    if protocol == "J1939" or all(message.frame_id & 0xFF == NULL_ADDRESS for message in extended):
-        for message in extended:
-            message.protocol = "j1939"

@@ -19,7 +19,7 @@ from ..source import NEVER, Channel, Report, ignore
 from ..units import declared_conversion, second_ns
 from . import sockets
 from .database import load_database
-from .ids import KnownIds, MessageIds, sender, shown_id
+from .ids import KnownIds, MessageIds, claim, sender, shown_id
 from .limits import SignalLimits, span_of
 from .readers import EXTENDED, GROUP, BusName, Raw, group_bits, group_of
 from .signals import extract, ordered, tabulate, vectorises
@@ -188,7 +188,7 @@ class Decoder:
         senders = sorted({sender(key) for key, _ in self._carriers[plan]})
         if len(senders) < 2:
             return
-        own = {sender(key) for key, _ in self._carriers[plan] if ids.names(key)}
+        own = {sender(key) for key, _ in self._carriers[plan] if claim(ids.first, key)}
         for key, bus in self._carriers[plan]:
             self._plan_of[key, bus] = plan if len(own) == 1 and sender(key) in own else -1
         fed = ", ".join(dict.fromkeys(one.name for one in channels))
@@ -271,21 +271,11 @@ class Decoder:
             bad[i] = 1
             return
         for j, name in enumerate(names):
-            value = found.get(name)
+            value, signal = found.get(name), message.get_signal_by_name(name)
             values[i, j] = np.nan if value is None else float(value)
-            missing = ABSENT if self._excluded(message, name, found) else SHORT
-            state[i, j] = missing if value is None else PRESENT
-
-    @staticmethod
-    def _excluded(message: Message, name: str, found: dict[str, float]) -> bool:
-        """Return whether a multiplexer excludes the signal from the frame."""
-        signal = message.get_signal_by_name(name)
-        while signal.multiplexer_signal is not None:
-            selector = found.get(signal.multiplexer_signal)
-            if selector is None or int(selector) not in (signal.multiplexer_ids or ()):
-                return True
-            signal = message.get_signal_by_name(signal.multiplexer_signal)
-        return False
+            selector = signal.multiplexer_signal
+            excluded = selector is not None and found.get(selector) not in (signal.multiplexer_ids or ())
+            state[i, j] = PRESENT if value is not None else ABSENT if excluded else SHORT
 
     def _report_undecodable(self, frames: Frames, bad: np.ndarray) -> None:
         for i in np.flatnonzero(bad):

@@ -55,15 +55,11 @@ class MessageIds:
             return key == self.key
         if group_of(key) != self.wanted or self.source not in (None, key & 0xFF):
             return False
-        own, other = _claim(self.first, key), max((_claim(one, key) for one in self.others), default=0)
+        own, other = claim(self.first, key), max((claim(one, key) for one in self.others), default=0)
         return own > other or (own == other and (not self.others or self.source is not None))
 
-    def names(self, key: int) -> bool:
-        """Return whether the id in the database has the addresses of a frame that fits."""
-        return _claim(self.first, key) > 0
 
-
-def _claim(known: int, key: int) -> int:
+def claim(known: int, key: int) -> int:
     """Return 2 if an id of a database is that of a frame but for its priority, 1 if it has no source, otherwise 0."""
     if (known ^ key) & ~PRIORITY & ~0xFF:
         return 0

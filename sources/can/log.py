@@ -167,7 +167,5 @@ def _candump(path: Path) -> tuple[int, int] | None:
     with path.open("rb") as file:
         head = file.read(TAIL_BYTES)
         file.seek(max(0, path.stat().st_size - TAIL_BYTES))
-        tail = file.read()
-    stamp = re.compile(rb"^\((\d+\.\d+)\) ", re.MULTILINE)
-    first, last = stamp.search(head), stamp.findall(tail)
-    return (second_ns(float(first[1])), second_ns(float(last[-1]))) if first and last else None
+        found = re.findall(rb"(?m)^\((\d+\.\d+)\) ", head + b"\n" + file.read())
+    return (second_ns(float(found[0])), second_ns(float(found[-1]))) if found else None
