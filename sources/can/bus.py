@@ -192,8 +192,7 @@ class CanBus:
         return True
 
     def _shut(self) -> None:
-        bus, self._bus = self._bus, None
-        frames, self._socket = self._socket, None
+        bus, frames, self._bus, self._socket = self._bus, self._socket, None, None
         if frames is not None:
             frames.close()
         if bus is not None:

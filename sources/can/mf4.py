@@ -196,18 +196,18 @@ def lost_records(mdf: MDF, content: bytes) -> str:
         if any(group.channel_group.flags & VLSD and any(group.signal_data or ()) for group in members):
             continue  # Only the records themselves hold their lengths.
         try:
-            promised = _size(content, int(data.data_block_addr), set())
+            promised = _size(content, int(data.data_block_addr))
         except (struct.error, ValueError) as error:
             return f"a block of records cannot be found: {error}"
         fixed = [group.channel_group for group in members if not group.channel_group.flags & VLSD]
         head = int(data.record_id_len)
-        sizes = [head + int(item.samples_byte_nr) + int(item.invalidation_bytes_nr) for item in fixed]
-        cycles = [int(item.cycles_nr) for item in fixed]
-        taken = sum(size * count for size, count in zip(sizes, cycles, strict=True))
         if promised is None:
             continue
+        taken = 0
+        for item in fixed:
+            taken += int(item.cycles_nr) * (head + int(item.samples_byte_nr) + int(item.invalidation_bytes_nr))
+            records += int(item.cycles_nr)
         kept += taken
-        records += sum(cycles)
         lost += abs(promised - taken)
     if not lost:
         return ""
@@ -215,10 +215,9 @@ def lost_records(mdf: MDF, content: bytes) -> str:
     return f"{lost} of {kept + lost} bytes of records{about} were not read"
 
 
-def _size(content: bytes, address: int, seen: set[int]) -> int | None:
+def _size(content: bytes, address: int) -> int | None:
     """Return the bytes of records in a data block, or in a list of them; None if they are stored by column."""
-    total = 0
-    waiting = [address]
+    total, waiting, seen = 0, [address], set[int]()
     while waiting:
         address = waiting.pop()
         if not address:

@@ -149,16 +149,14 @@ class _StoredBytes:
 class _Lines:
     """Lines of a text log, which can be read on after one that python-can cannot read.
 
-    python-can's readers begin with the header each time, for which `go_on` gives an empty line.
+    python-can's readers begin with the header each time, for which `refuse` adds an empty line.
     """
 
     def __init__(self, file: TextIOWrapper) -> None:
         file.reconfigure(encoding="utf-8", errors="replace")  # comments may have any encoding
-        self._file, self._empty, self._line, self._again = file, False, "", False
-        self.number = 0
-        """Number of the last line."""
-        self.bad = 0
-        """Lines that could not be read."""
+        self._file, self._line = file, ""
+        self._pending: list[str] = []
+        self._number = self._bad = 0  # Number of the last line, and lines that could not be read
         self.fault = ""
 
     @property
@@ -170,29 +168,26 @@ class _Lines:
         return self
 
     def __next__(self) -> str:
-        if self._empty:
-            self._empty = False
-            return "\n"
-        if self._again:
-            self._again = False
-            return self._line
+        if self._pending:
+            return self._pending.pop()
         for line in self._file:
-            self.number, self._line = self.number + 1, line
+            self._number, self._line = self._number + 1, line
             if not (zeros := line.count("\0")):  # python-can skips such a line, or reads what is left of it
                 return line
             self.refuse(f"{zeros} of its bytes are zero")
-            self._empty = False
+            self._pending.clear()
         raise StopIteration
 
     def repeat(self) -> None:
         """Give the last line once more."""
-        self._again = bool(self._line)
+        if self._line:
+            self._pending.append(self._line)
 
     def refuse(self, error: object) -> None:
         """Count the last line as unreadable."""
-        self.bad += 1
-        self._empty = True
-        self.fault = refused(self.fault, self.bad, "line", f"line {self.number}", error)
+        self._bad += 1
+        self._pending.append("\n")
+        self.fault = refused(self.fault, self._bad, "line", f"line {self._number}", error)
 
     def close(self) -> None:
         """Close the file."""

@@ -130,11 +130,13 @@ class TextLog(TextIOMessageReader):
         return filter(None, map(self._parse, self.file))
 
 
-def _frame(time: float, key: str, bus: int | str, size: int, data: bytes, **flags: bool) -> can.Message:
-    if len(data) != size and not flags["is_remote_frame"]:
+def _frame(
+    time: float, key: str, extended: bool, bus: int | str, size: int, data: bytes, remote: bool, error: bool = False
+) -> can.Message:
+    if len(data) != size and not remote:
         raise ValueError(f"it has {len(data)} of {size} bytes")
     number = int(key, 16) & 0x1FFFFFFF
-    return can.Message(timestamp=time, arbitration_id=number, channel=bus, data=data, is_fd=size > 8, **flags)
+    return can.Message(time, number, extended, remote, error, bus, data=data, is_fd=size > 8)
 
 
 class ColumnLines:
@@ -154,16 +156,11 @@ class ColumnLines:
             return None
         cells = line.split(self._delimiter)
         time, key, extended, bus, count, first = self._places
-        size = int(cells[count])
-        return _frame(
-            int(cells[time]) / 1e6 if self._gvret else float(cells[time]),
-            cells[key],
-            int(cells[bus]),
-            size,
-            bytes.fromhex(" ".join(cells[first : first + size]) if self._gvret else cells[first]),
-            is_extended_id=cells[extended].lower() in ("true", "1"),
-            is_remote_frame=self._remote is not None and cells[self._remote] == "1",
-        )
+        size, long = int(cells[count]), cells[extended].lower() in ("true", "1")
+        t = int(cells[time]) / 1e6 if self._gvret else float(cells[time])
+        data = bytes.fromhex(" ".join(cells[first : first + size]) if self._gvret else cells[first])
+        remote = self._remote is not None and cells[self._remote] == "1"
+        return _frame(t, cells[key], long, int(cells[bus]), size, data, remote)
 
 
 class CandumpLines:
@@ -201,18 +198,10 @@ class CandumpLines:
             time = _stamp(self._zone, datetime.fromisoformat(match["time"].strip()))
         else:
             time = self._t = float(match["time"]) + self._t * self._sums
-        size, rest = int(match["size"]), match["data"]
-        remote = "remote request" in rest
-        return _frame(
-            round(time, 6),
-            match["id"],
-            match["bus"],
-            size,
-            b"" if remote else bytes.fromhex(rest.strip()[: max(0, 3 * size - 1)]),
-            is_extended_id=len(match["id"]) > 3,
-            is_error_frame=rest.endswith("ERRORFRAME"),
-            is_remote_frame=remote,
-        )
+        size, rest, key = int(match["size"]), match["data"], match["id"]
+        remote, error = "remote request" in rest, rest.endswith("ERRORFRAME")
+        data = b"" if remote else bytes.fromhex(rest.strip()[: max(0, 3 * size - 1)])
+        return _frame(round(time, 6), key, len(key) > 3, match["bus"], size, data, remote, error)
 
 
 class AscLog(can.ASCReader):
