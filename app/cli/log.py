@@ -9,7 +9,7 @@ import numpy as np
 
 from estimators.diagnostics.repeats import find_repeats
 from estimators.errors import ConfigError, nearest, quoted
-from sources.can.decoder import shown_id
+from sources.can.ids import shown_id
 from sources.can.readers import EXTENDED, BusName
 from sources.formats import files_of
 from sources.inspect import (

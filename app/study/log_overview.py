@@ -14,8 +14,7 @@ import numpy as np
 
 from estimators.errors import ConfigError, SourceError
 from sources.can.database import load_database
-from sources.can.decoder import shown_id
-from sources.can.ids import KnownIds
+from sources.can.ids import KnownIds, shown_id
 from sources.can.readers import BusName
 from sources.formats import files_of
 from sources.inspect import Message, RecordingContents, SignalSeries, inspect_recordings, is_table

@@ -21,7 +21,7 @@ from estimators.log import Events
 
 from ..source import LOST_FRAMES, NEVER, Report, ignore
 from ..worker_process import gist
-from .decoder import Decoder, Expected
+from .decoder import Decoder
 from .ids import MessageIds
 from .readers import EXTENDED, BusName
 from .sockets import FrameSocket, Message, frame_socket
@@ -192,8 +192,7 @@ class CanBus:
         return True
 
     def _shut(self) -> None:
-        bus, self._bus = self._bus, None
-        frames, self._socket = self._socket, None
+        bus, frames, self._bus, self._socket = self._bus, self._socket, None, None
         if frames is not None:
             frames.close()
         if bus is not None:
@@ -299,7 +298,13 @@ class MessageMonitor:
         if not self._seen:
             if not self._silence_reported:
                 self._silence_reported = True
-                self._report(NEVER, self._silence(waiting))
+                named = ", ".join(f"{item.name} ({item.ids})" for item in waiting[:4])
+                more = ", ..." if len(waiting) > 4 else ""
+                self._report(
+                    NEVER,
+                    f"{self._name}: none of {named}{more} was received in {MISSING_AFTER_S:g} s; check interface, "
+                    "channel and bit rate, and the ids in the DBC",
+                )
             return
         for item in waiting:
             texts = self._decoder.missing(item, self._seen, least=MIN_MULTIPLEXED_FRAMES)
@@ -309,11 +314,3 @@ class MessageMonitor:
             for text in texts:
                 self._report(NEVER, f"{self._name}: after {waited:.0f} s {text}")
         self._done = all(item.ids in self._reported for item in waiting)
-
-    def _silence(self, waiting: list[Expected]) -> str:
-        named = ", ".join(f"{item.name} ({item.ids})" for item in waiting[:4])
-        more = ", ..." if len(waiting) > 4 else ""
-        return (
-            f"{self._name}: none of {named}{more} was received in {MISSING_AFTER_S:g} s; check interface, "
-            "channel and bit rate, and the ids in the DBC"
-        )

@@ -4,22 +4,22 @@ from __future__ import annotations
 
 import logging
 import re
+from contextlib import suppress
 from functools import lru_cache
 from pathlib import Path
 
 import cantools
-from cantools.database.can import Database, Message
+from cantools.database.can import Database
 
 from estimators.errors import SourceError
 
 from ..worker_process import gist
 from .ids import NULL_ADDRESS
 
-DOUBLE_BYTES = re.compile(rb"[\x81-\xfe][\x40-\x7e\x80-\xfe]")
-USUAL_DOUBLE = re.compile(rb"[\xa1-\xa3\xb0-\xd7][\xa1-\xfe]")
-"""Characters of two bytes in GB18030, and its usual ones: the signs and the first level of GB2312."""
+USUAL = re.compile(rb"[\xa1-\xa3\xb0-\xd7][\xa1-\xfe]")
+"""Usual characters of GB18030: the signs and the first level of GB2312."""
 
-MIN_USUAL = 0.5  # Share of usual ones among them from which on a DBC is in Chinese
+MIN_USUAL = 0.5  # Share of usual ones among those beyond ASCII from which on a DBC is in Chinese
 
 
 def load_database(path: Path) -> Database:
@@ -37,22 +37,24 @@ def load_database(path: Path) -> Database:
 
 @lru_cache(maxsize=16)
 def _load(path: Path, stamp: int) -> Database:
-    logger = logging.getLogger("cantools")
-    level = logger.level
-    logger.setLevel(logging.ERROR)  # It warns of duplicate names, which are harmless.
+    logging.getLogger("cantools").setLevel(logging.ERROR)  # It warns of duplicate names, which are harmless.
     try:
         # Not strict: signals of DBC files in use overlap, which is harmless where they are not read.
         encoding = encoding_of(path.read_bytes()) if path.suffix.lower() == ".dbc" else None
         database = cantools.database.load_file(path, encoding=encoding, strict=False)
     except (cantools.database.UnsupportedDatabaseFormatError, cantools.database.Error, OSError, ValueError) as error:
         raise SourceError(f"{path}: it cannot be read as a DBC ({gist(error)}); check that it is one") from None
-    finally:
-        logger.setLevel(level)
     if not isinstance(database, Database):
         raise SourceError(f"{path}: it describes no CAN messages; give a DBC")
     protocol = database.dbc.attributes.get("ProtocolType") if database.dbc is not None else None
     formats = database.dbc is not None and "VFrameFormat" in database.dbc.attribute_definitions
-    _mark_j1939(database.messages, None if protocol is None or formats else str(protocol.value))
+    extended = [message for message in database.messages if message.is_extended_frame]
+    # By their form, ids are those of J1939 if their source is the null address, which is never that of a frame.
+    if (protocol is not None and protocol.value == "J1939" and not formats) or all(
+        message.frame_id & 0xFF == NULL_ADDRESS for message in extended
+    ):
+        for message in extended:
+            message.protocol = "j1939"
     return database
 
 
@@ -61,24 +63,11 @@ def encoding_of(content: bytes) -> str:
 
     In a text of Windows-1252, such as `°C` or `Größe`, two bytes beyond ASCII are rarely a usual Chinese character.
     """
-    for encoding in ("utf-8-sig", "gb18030"):
-        try:
-            content.decode(encoding)
-        except UnicodeDecodeError:
-            continue
-        pairs = DOUBLE_BYTES.findall(content)
-        usual = sum(USUAL_DOUBLE.fullmatch(pair) is not None for pair in pairs)
-        if encoding != "gb18030" or usual >= MIN_USUAL * len(pairs):
-            return encoding
+    with suppress(UnicodeDecodeError):
+        content.decode("utf-8-sig")
+        return "utf-8-sig"
+    with suppress(UnicodeDecodeError):
+        signs = [sign.encode("gb18030") for sign in content.decode("gb18030") if sign > "\x7f"]
+        if sum(USUAL.fullmatch(sign) is not None for sign in signs) >= MIN_USUAL * len(signs):
+            return "gb18030"
     return "cp1252"
-
-
-def _mark_j1939(messages: list[Message], protocol: str | None) -> None:
-    """Mark the extended messages of a database as those of J1939, by its protocol or the form of its ids.
-
-    They have the form if their source is the null address, which is never that of a frame.
-    """
-    extended = [message for message in messages if message.is_extended_frame]
-    if protocol == "J1939" or all(message.frame_id & 0xFF == NULL_ADDRESS for message in extended):
-        for message in extended:
-            message.protocol = "j1939"

@@ -19,9 +19,9 @@ from ..source import NEVER, Channel, Report, ignore
 from ..units import declared_conversion, second_ns
 from . import sockets
 from .database import load_database
-from .ids import KnownIds, MessageIds, sender
+from .ids import KnownIds, MessageIds, claim, sender, shown_id
 from .limits import SignalLimits, span_of
-from .readers import EXTENDED, GROUP, GROUP_BITS, BusName, Raw, group_of
+from .readers import EXTENDED, GROUP, BusName, Raw, group_bits, group_of
 from .signals import extract, ordered, tabulate, vectorises
 from .transport import TRANSPORT, Transport
 
@@ -69,11 +69,14 @@ class Decoder:
             messages, bus, path = find_messages(databases, channel)
             for message in messages:
                 grouped.setdefault((id(message), channel.source), (message, bus, path, []))[3].append(channel)
-        self._ids = [known.ids(message, source) for (_, source), (message, *_) in zip(grouped, grouped.values())]
-        self._plans = [
-            (_as_j1939(message) if ids.j1939 else message, *others)
-            for ids, (message, *others) in zip(self._ids, grouped.values(), strict=True)
-        ]
+        self._ids: list[MessageIds] = []
+        self._plans: list[tuple[Message, BusName, Path, list[Channel]]] = []
+        for (_, source), (message, *others) in grouped.items():
+            ids = known.ids(message, source)
+            own = copy(message)
+            own.protocol = "j1939" if ids.j1939 else message.protocol  # with its codes for missing values
+            self._ids.append(ids)
+            self._plans.append((own, *others))
         self._check_unique()
         self.wanted = frozenset(ids.wanted for ids in self._ids)
         """Ids of the frames that some channel needs, EXTENDED added, or parameter groups of J1939 (`group_of`)."""
@@ -131,7 +134,7 @@ class Decoder:
         return [
             {
                 "can_id": key & ~(EXTENDED | GROUP),
-                "can_mask": _mask(key) if key & GROUP else 0x1FFFFFFF if key & EXTENDED else 0x7FF,
+                "can_mask": group_bits(key) if key & GROUP else 0x1FFFFFFF if key & EXTENDED else 0x7FF,
                 "extended": bool(key & EXTENDED),
             }
             for key in sorted(self.wanted)
@@ -185,7 +188,7 @@ class Decoder:
         senders = sorted({sender(key) for key, _ in self._carriers[plan]})
         if len(senders) < 2:
             return
-        own = {sender(key) for key, _ in self._carriers[plan] if ids.names(key)}
+        own = {sender(key) for key, _ in self._carriers[plan] if claim(ids.first, key)}
         for key, bus in self._carriers[plan]:
             self._plan_of[key, bus] = plan if len(own) == 1 and sender(key) in own else -1
         fed = ", ".join(dict.fromkeys(one.name for one in channels))
@@ -268,21 +271,11 @@ class Decoder:
             bad[i] = 1
             return
         for j, name in enumerate(names):
-            value = found.get(name)
+            value, signal = found.get(name), message.get_signal_by_name(name)
             values[i, j] = np.nan if value is None else float(value)
-            missing = ABSENT if self._excluded(message, name, found) else SHORT
-            state[i, j] = missing if value is None else PRESENT
-
-    @staticmethod
-    def _excluded(message: Message, name: str, found: dict[str, float]) -> bool:
-        """Return whether a multiplexer excludes the signal from the frame."""
-        signal = message.get_signal_by_name(name)
-        while signal.multiplexer_signal is not None:
-            selector = found.get(signal.multiplexer_signal)
-            if selector is None or int(selector) not in (signal.multiplexer_ids or ()):
-                return True
-            signal = message.get_signal_by_name(signal.multiplexer_signal)
-        return False
+            selector = signal.multiplexer_signal
+            excluded = selector is not None and found.get(selector) not in (signal.multiplexer_ids or ())
+            state[i, j] = PRESENT if value is not None else ABSENT if excluded else SHORT
 
     def _report_undecodable(self, frames: Frames, bad: np.ndarray) -> None:
         for i in np.flatnonzero(bad):
@@ -327,11 +320,6 @@ class Expected(NamedTuple):
     period: float
 
 
-def shown_id(key: int) -> str:
-    """Return an id as text: 0x7e8, or 0x18fef100x of an extended frame."""
-    return f"{key & ~EXTENDED:#x}{'x' if key & EXTENDED else ''}"
-
-
 def _nearest_match(item: Expected, seen: FrameCounts) -> str:
     """Describe the nearest match of a missing message: its id on another bus, near ids, or the buses."""
     if not seen:
@@ -357,20 +345,6 @@ def _nearest_match(item: Expected, seen: FrameCounts) -> str:
 def _list(buses: Sequence[BusName]) -> str:
     shown = ", ".join("without a name" if bus is None else str(bus) for bus in buses[:MAX_NAMED_IDS])
     return shown + (", ..." if len(buses) > MAX_NAMED_IDS else "")
-
-
-def _as_j1939(message: Message) -> Message:
-    """Return a message with the codes of J1939 for missing values."""
-    if message.protocol == "j1939":
-        return message
-    message = copy(message)
-    message.protocol = "j1939"
-    return message
-
-
-def _mask(group: int) -> int:
-    """Return the bits of an id that name its parameter group."""
-    return GROUP_BITS[group >> 16 & 0xFF >= 240] & ~EXTENDED
 
 
 def same_bus(wanted: BusName, actual: BusName) -> bool:

@@ -8,6 +8,7 @@ Source: SAE J1939-21, section 5.
 
 from __future__ import annotations
 
+from collections import defaultdict
 from collections.abc import Iterable
 from dataclasses import dataclass
 
@@ -33,7 +34,7 @@ class MessageIds:
 
     def __str__(self) -> str:
         if not self.j1939:
-            return f"{self.key & ~EXTENDED:#x}{'x' if self.key & EXTENDED else ''}"
+            return shown_id(self.key)
         sender = "" if self.source is None else f" from source {self.source:#04x}"
         return f"PGN {(self.wanted >> 8) & 0x3FFFF}{sender}"
 
@@ -52,23 +53,22 @@ class MessageIds:
         """Return whether a frame of an id, with EXTENDED, carries the message."""
         if not self.j1939:
             return key == self.key
-        if group_of(key) != self.wanted:
+        if group_of(key) != self.wanted or self.source not in (None, key & 0xFF):
             return False
-        if self.source not in (None, key & 0xFF):
-            return False
-        own, other = _claim(self.first, key), max((_claim(one, key) for one in self.others), default=0)
+        own, other = claim(self.first, key), max((claim(one, key) for one in self.others), default=0)
         return own > other or (own == other and (not self.others or self.source is not None))
 
-    def names(self, key: int) -> bool:
-        """Return whether the id in the database has the addresses of a frame that fits."""
-        return _claim(self.first, key) > 0
 
-
-def _claim(known: int, key: int) -> int:
+def claim(known: int, key: int) -> int:
     """Return 2 if an id of a database is that of a frame but for its priority, 1 if it has no source, otherwise 0."""
     if (known ^ key) & ~PRIORITY & ~0xFF:
         return 0
     return 2 if known & 0xFF == key & 0xFF else int(known & 0xFF == NULL_ADDRESS)
+
+
+def shown_id(key: int) -> str:
+    """Return an id as text: 0x7e8, or 0x18fef100x of an extended frame."""
+    return f"{key & ~EXTENDED:#x}{'x' if key & EXTENDED else ''}"
 
 
 def sender(key: int) -> str:
@@ -82,12 +82,12 @@ class KnownIds:
 
     def __init__(self, messages: Iterable[Message]) -> None:
         self._exact: dict[int, Message] = {}
-        self._groups: dict[int, list[Message]] = {}
+        self._groups: dict[int, list[Message]] = defaultdict(list)
         for message in messages:
             key = key_of(message)
             self._exact.setdefault(key, message)
             if key & EXTENDED:
-                self._groups.setdefault(group_of(key), []).append(message)
+                self._groups[group_of(key)].append(message)
 
     def ids(self, message: Message, source: int | None = None) -> MessageIds:
         """Return the ids of a message, or those from one source address, which only J1939 has."""

@@ -6,6 +6,7 @@ import os
 import re
 from collections import Counter
 from collections.abc import Generator, Sequence
+from contextlib import suppress
 from functools import cached_property, lru_cache
 from pathlib import Path
 
@@ -142,7 +143,7 @@ TAIL_BYTES = 4096  # Bytes at the end of a text log that hold its last lines
 
 def _span(path: Path) -> tuple[int, int] | None:
     kind = path.suffix.lower()
-    try:
+    with suppress(OSError, ValueError, SourceError):  # Errors are reported when the file is read.
         if kind == ".mf4":
             stat = path.stat()
             return _mf4(path, stat.st_mtime_ns, stat.st_size)
@@ -153,9 +154,6 @@ def _span(path: Path) -> tuple[int, int] | None:
             return span if span[1] > span[0] > 0 else None
         if kind == ".log":
             return _candump(path)
-    except (OSError, ValueError, SourceError):
-        # Errors are reported when the file is read.
-        return None
     return None
 
 
@@ -169,7 +167,5 @@ def _candump(path: Path) -> tuple[int, int] | None:
     with path.open("rb") as file:
         head = file.read(TAIL_BYTES)
         file.seek(max(0, path.stat().st_size - TAIL_BYTES))
-        tail = file.read()
-    stamp = re.compile(rb"^\((\d+\.\d+)\) ", re.MULTILINE)
-    first, last = stamp.search(head), stamp.findall(tail)
-    return (second_ns(float(first[1])), second_ns(float(last[-1]))) if first and last else None
+        found = re.findall(rb"(?m)^\((\d+\.\d+)\) ", head + b"\n" + file.read())
+    return (second_ns(float(found[0])), second_ns(float(found[-1]))) if found else None

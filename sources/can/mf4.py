@@ -13,7 +13,7 @@ import logging
 import struct
 import sys
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import closing, contextmanager
 from io import BytesIO
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -21,25 +21,11 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from ..worker_process import gist
-from .readers import CHUNK_FRAMES, EXTENDED, BusName, LogSummary, Raw, is_wanted, unreadable
+from .readers import CHUNK_FRAMES, EXTENDED, BusName, LogSummary, Raw, unreadable, wanted_rows
 
 if TYPE_CHECKING:
     from asammdf import MDF, Signal
     from asammdf.blocks.mdf_v4 import Group
-
-
-@contextmanager
-def _quiet() -> Iterator[None]:
-    """Suppress messages of asammdf when a partly opened file is released."""
-    logger, hook = logging.getLogger("asammdf"), sys.unraisablehook
-    level = logger.level
-    logger.setLevel(logging.CRITICAL + 1)
-    sys.unraisablehook = lambda _: None
-    try:
-        yield
-    finally:
-        sys.unraisablehook = hook
-        logger.setLevel(level)
 
 
 @contextmanager
@@ -49,28 +35,26 @@ def opened(path: Path) -> Iterator[tuple[MDF, bytes]]:
     Raises:
         SourceError: If nothing can be read.
     """
-    with _quiet():
-        mdf, content = _open(path)
-        try:
-            yield mdf, content.getvalue()
-        finally:
-            mdf.close()
-
-
-def _open(path: Path) -> tuple[MDF, BytesIO]:
     from asammdf import MDF  # Here, not above: it takes long, and most logs have other formats.
 
     # From memory: asammdf completes an unfinished file (a logger that lost power) in place.
-    content = BytesIO(path.read_bytes())
+    content, fault = BytesIO(path.read_bytes()), None
+    logging.getLogger("asammdf").setLevel(logging.CRITICAL + 1)
+    hook, sys.unraisablehook = sys.unraisablehook, lambda _: None
     try:
-        return MDF(content), content
-    except MemoryError:
-        raise
-    except Exception as error:  # noqa: BLE001  a damaged file makes asammdf raise anything
-        fault = unreadable(path, error)
-    # A partly opened file prints messages when it is released; do that here, where they are suppressed.
-    gc.collect()
-    raise fault
+        try:
+            mdf = MDF(content)
+        except MemoryError:
+            raise
+        except Exception as error:  # noqa: BLE001  a damaged file makes asammdf raise anything
+            fault = unreadable(path, error)
+        if fault:
+            gc.collect()  # A partly opened file prints messages when it is released.
+            raise fault
+        with closing(mdf):
+            yield mdf, content.getvalue()
+    finally:
+        sys.unraisablehook = hook
 
 
 def read_mf4(path: Path, wanted: frozenset[int] | None, longest: int) -> Iterator[Raw | LogSummary]:
@@ -172,7 +156,7 @@ def _columns(signal: Signal, start: int, wanted: frozenset[int] | None, longest:
     if extended is not None:
         key |= np.where(np.asarray(extended, np.int64) != 0, EXTENDED, 0)
     bus = np.full(key.size, NO_BUS) if buses is None else np.asarray(buses, np.int64)
-    rows = np.arange(key.size) if wanted is None else np.flatnonzero(is_wanted(key, wanted))
+    rows = wanted_rows(key, wanted)
     data = np.zeros((rows.size, longest), np.uint8)
     given = np.asarray(column("DataBytes"))
     if given.ndim == 2:
@@ -212,18 +196,18 @@ def lost_records(mdf: MDF, content: bytes) -> str:
         if any(group.channel_group.flags & VLSD and any(group.signal_data or ()) for group in members):
             continue  # Only the records themselves hold their lengths.
         try:
-            promised = _size(content, int(data.data_block_addr), set())
+            promised = _size(content, int(data.data_block_addr))
         except (struct.error, ValueError) as error:
             return f"a block of records cannot be found: {error}"
         fixed = [group.channel_group for group in members if not group.channel_group.flags & VLSD]
         head = int(data.record_id_len)
-        sizes = [head + int(item.samples_byte_nr) + int(item.invalidation_bytes_nr) for item in fixed]
-        cycles = [int(item.cycles_nr) for item in fixed]
-        taken = sum(size * count for size, count in zip(sizes, cycles, strict=True))
         if promised is None:
             continue
+        taken = 0
+        for item in fixed:
+            taken += int(item.cycles_nr) * (head + int(item.samples_byte_nr) + int(item.invalidation_bytes_nr))
+            records += int(item.cycles_nr)
         kept += taken
-        records += sum(cycles)
         lost += abs(promised - taken)
     if not lost:
         return ""
@@ -231,10 +215,9 @@ def lost_records(mdf: MDF, content: bytes) -> str:
     return f"{lost} of {kept + lost} bytes of records{about} were not read"
 
 
-def _size(content: bytes, address: int, seen: set[int]) -> int | None:
+def _size(content: bytes, address: int) -> int | None:
     """Return the bytes of records in a data block, or in a list of them; None if they are stored by column."""
-    total = 0
-    waiting = [address]
+    total, waiting, seen = 0, [address], set[int]()
     while waiting:
         address = waiting.pop()
         if not address:

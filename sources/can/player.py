@@ -98,7 +98,7 @@ class Player:
             batch = self._source.read(0.0)
             if batch is None:
                 return
-            for t, events in self._moments(batch):
+            for t, events in self._moments(batch).items():
                 wait = begun + t - self._clock()
                 if wait > 0 and self._stop.wait(wait * 1e-9):
                     return
@@ -107,14 +107,12 @@ class Player:
                     begun -= wait
                 self._send(t, events)
 
-    def _moments(self, batch: Events) -> list[tuple[int, list[tuple[int, int, Sequence[float]]]]]:
+    def _moments(self, batch: Events) -> dict[int, list[tuple[int, int, Sequence[float]]]]:
         """Return the events of a batch by arrival time; every input and every true state is an event of its own."""
-        moments: list[tuple[int, list[tuple[int, int, Sequence[float]]]]] = []
+        moments: dict[int, list[tuple[int, int, Sequence[float]]]] = {}
         columns = (batch.arrival.tolist(), batch.kind.tolist(), batch.channel.tolist(), batch.value.tolist())
         for t, kind, channel, value in zip(*columns, strict=True):
-            if not moments or moments[-1][0] != t:
-                moments.append((t, []))
-            events = moments[-1][1]
+            events = moments.setdefault(t, [])
             if kind == INPUT:
                 events += [(INPUT, k, (value[k],)) for k in self._inputs]
             elif kind == TRUTH:
@@ -182,16 +180,13 @@ class Encoder:
         # By an event's kind and index: its frame and, for each row, signal, slope, offset and range of the conversion.
         self._routes: dict[tuple[int, int], tuple[_Frame, list[tuple[str, float, float, float, float]]]] = {}
         for channel in channels:
-            if channel.convert is not None:
-                raise SourceError(
-                    f"{channel.name}: convert is {channel.convert}; it cannot be encoded, so leave it out"
-                )
-            if channel.only:
-                raise SourceError(f"{channel.name}: only picks frames; it cannot be encoded, so leave it out")
-            if channel.accuracy is not None:
-                raise SourceError(
-                    f"{channel.name}: accuracy comes from the asset; it cannot be encoded, so leave it out"
-                )
+            for given, text in (
+                (channel.convert, f"convert is {channel.convert}"),
+                (channel.only, "only picks frames"),
+                (channel.accuracy, "accuracy comes from the asset"),
+            ):
+                if given:
+                    raise SourceError(f"{channel.name}: {text}; it cannot be encoded, so leave it out")
             messages, _, path = find_messages(databases, channel)
             message = messages[0]
             if any(signal.multiplexer_ids for signal in message.signals):
@@ -210,20 +205,6 @@ class Encoder:
                 frame.values[condition.signal] = min(max(0.0, condition.low, low), condition.high, high)
             self._routes[channel.kind, channel.index] = (frame, rows)
 
-    def set(self, kind: int, index: int, values: Sequence[float]) -> _Frame | None:
-        """Put an event's values into its message, and return the message, if there is one."""
-        route = self._routes.get((kind, index))
-        if route is None:
-            return None
-        frame, rows = route
-        for (name, slope, shift, low, high), value in zip(rows, values, strict=False):
-            if math.isnan(value):
-                frame.lost = frame.lost or kind != INPUT  # an input that is NaN keeps its value
-            else:
-                frame.values[name] = min(max((value - shift) / slope, low), high)
-                frame.known.add(name)
-        return frame
-
     def frames(self, t: int, events: Sequence[tuple[int, int, Sequence[float]]]) -> list[can.Message]:
         """Return the frames of the events of one time: (kind, index, values), inputs and true states one by one.
 
@@ -233,8 +214,16 @@ class Encoder:
         """
         touched: dict[int, _Frame] = {}
         for kind, index, values in events:
-            frame = self.set(kind, index, values)
-            if frame is not None and (kind == READING or not frame.reads):
+            if (kind, index) not in self._routes:
+                continue
+            frame, rows = self._routes[kind, index]
+            for (name, slope, shift, low, high), value in zip(rows, values, strict=False):
+                if math.isnan(value):
+                    frame.lost = frame.lost or kind != INPUT  # an input that is NaN keeps its value
+                else:
+                    frame.values[name] = min(max((value - shift) / slope, low), high)
+                    frame.known.add(name)
+            if kind == READING or not frame.reads:
                 touched[id(frame)] = frame
         for (kind, _), (frame, _) in self._routes.items():
             if kind == INPUT and not frame.reads and (frame.sent_at is None or t - frame.sent_at >= INPUT_REPEAT_NS):

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import logging
-import os
 import re
 import sqlite3
 import struct
@@ -11,9 +10,8 @@ from collections import Counter
 from collections.abc import Iterator
 from contextlib import suppress
 from io import TextIOWrapper
-from itertools import islice
 from pathlib import Path
-from typing import NamedTuple
+from typing import NamedTuple, TypeVar
 
 import can
 import numpy as np
@@ -70,51 +68,39 @@ def read_messages(
     lines = _Lines(reader.file) if isinstance(getattr(reader, "file", None), TextIOWrapper) else None
     if lines:
         reader.file = lines
-    seen: Counter[tuple[BusName, int]] = Counter()
-    buses: dict[BusName, int] = {}
-    count = errors = broken = 0
+    columns = Columns(wanted, longest)
+    size, chunk = FIRST_CHUNK_FRAMES, list[can.Message]()
     fault = ""
     try:
-        messages = _by_lines(path, reader, lines) if lines else iter(reader)
-        size = FIRST_CHUNK_FRAMES
-        while True:
-            chunk: list[can.Message] = []
-            block: Raw | None = None
-            try:
-                # One by one, so that frames before the fault are kept.
-                for message in islice(messages, size):
-                    if isinstance(message, tuple):
-                        block = Raw(*message)
-                        break
-                    chunk.append(message)
-            except SourceError:
-                raise
-            except Exception as error:  # noqa: BLE001  as above
-                fault = f"{gist(error)} after frame {count + len(chunk)}"
-            count += len(chunk)
-            errors += sum(message.is_error_frame for message in chunk)
-            if chunk or block is None:
-                raw, lost = _columns(chunk, wanted, longest, buses, seen)
-                broken += lost
-                yield raw
-            if block is not None:
-                count += block.total
-                yield _selected(block, wanted, longest, buses, seen)
-            elif fault or len(chunk) < size:
-                break
-            size = CHUNK_FRAMES
+        try:
+            for item in _by_lines(path, reader, lines) if lines else reader:
+                if isinstance(item, tuple):
+                    if chunk:
+                        yield columns.of_messages(chunk)
+                    yield columns.of_block(Raw(*item))
+                    chunk = []
+                    continue
+                chunk.append(item)
+                if len(chunk) == size:
+                    yield columns.of_messages(chunk)
+                    size, chunk = CHUNK_FRAMES, []
+        except SourceError:
+            raise
+        except Exception as error:  # noqa: BLE001  as above; frames before the fault are kept
+            fault = f"{gist(error)} after frame {columns.total + len(chunk)}"
+        yield columns.of_messages(chunk)
         if bad := getattr(reader, "bad", ()):
             fault = refused("", len(bad), "block", *bad[0])
-        fault = fault or getattr(lines, "fault", "") or warned.fault or _missing_end(path, reader)
-        if broken:
-            fault = fault or f"{broken} frames hold no numbers"
+        fault = fault or getattr(lines, "fault", "") or warned.fault or _missing_end(path, reader, lines)
+        if columns.broken:
+            fault = fault or f"{columns.broken} frames hold no numbers"
     finally:
         # SQLite lets only the opening thread close a file; otherwise it is closed with its last reference.
         with suppress(sqlite3.ProgrammingError):
             reader.stop()
-    if fault and not count:
+    if fault and not columns.total:
         raise unreadable(path, fault)
-    yield LogSummary(dict(seen), errors, fault)
+    yield LogSummary(dict(columns.seen), columns.errors, fault)
 
 
 def _correct_readers() -> None:
@@ -163,45 +149,45 @@ class _StoredBytes:
 class _Lines:
     """Lines of a text log, which can be read on after one that python-can cannot read.
 
-    python-can's readers begin with the header each time, for which `go_on` gives an empty line.
+    python-can's readers begin with the header each time, for which `refuse` adds an empty line.
     """
 
     def __init__(self, file: TextIOWrapper) -> None:
         file.reconfigure(encoding="utf-8", errors="replace")  # comments may have any encoding
-        self._file, self._empty, self._line, self._again = file, False, "", False
-        self.number = 0
-        """Number of the last line."""
-        self.bad = 0
-        """Lines that could not be read."""
+        self._file, self._line = file, ""
+        self._pending: list[str] = []
+        self._number = self._bad = 0  # Number of the last line, and lines that could not be read
         self.fault = ""
+
+    @property
+    def incomplete(self) -> bool:
+        """Whether the last line has no end."""
+        return self._line[-1:] not in ("", "\n")
 
     def __iter__(self) -> _Lines:
         return self
 
     def __next__(self) -> str:
-        if self._empty:
-            self._empty = False
-            return "\n"
-        if self._again:
-            self._again = False
-            return self._line
+        if self._pending:
+            return self._pending.pop()
         for line in self._file:
-            self.number, self._line = self.number + 1, line
+            self._number, self._line = self._number + 1, line
             if not (zeros := line.count("\0")):  # python-can skips such a line, or reads what is left of it
                 return line
             self.refuse(f"{zeros} of its bytes are zero")
-            self._empty = False
+            self._pending.clear()
         raise StopIteration
 
     def repeat(self) -> None:
         """Give the last line once more."""
-        self._again = bool(self._line)
+        if self._line:
+            self._pending.append(self._line)
 
     def refuse(self, error: object) -> None:
         """Count the last line as unreadable."""
-        self.bad += 1
-        self._empty = True
-        self.fault = refused(self.fault, self.bad, "line", f"line {self.number}", error)
+        self._bad += 1
+        self._pending.append("\n")
+        self.fault = refused(self.fault, self._bad, "line", f"line {self._number}", error)
 
     def close(self) -> None:
         """Close the file."""
@@ -262,71 +248,67 @@ class _Warnings(logging.Handler):
         return f"{self._count} × {self._first}" if self._count > 1 else self._first
 
 
-def _columns(
-    messages: list[can.Message],
-    wanted: frozenset[int] | None,
-    longest: int,
-    buses: dict[BusName, int],
-    seen: Counter[tuple[BusName, int]],
-) -> tuple[Raw, int]:
-    """Return the messages of python-can as columns, and how many are damaged; error and remote frames have no data."""
-    t, keys, places, length, chunks = [], [], [], [], []
-    broken = 0
-    for message in messages:
-        if message.is_error_frame or message.is_remote_frame:
-            continue
-        try:
-            # A damaged database holds other types.
-            key = int(message.arbitration_id) & 0x1FFFFFFF
-            if message.is_extended_id:
-                key |= EXTENDED
-            bus = message.channel
-            seen[bus, key] += 1
-            if wanted is not None and key not in wanted and group_of(key) not in wanted:
+class Columns:
+    """Frames of a log as columns, the wanted ones; all of them are counted. Arguments as those of `read_messages`."""
+
+    def __init__(self, wanted: frozenset[int] | None, longest: int) -> None:
+        self._wanted, self._longest = wanted, longest
+        self._buses: dict[BusName, int] = {}
+        self.seen: Counter[tuple[BusName, int]] = Counter()
+        """Data frames so far, by bus and id."""
+        self.total = self.errors = self.broken = 0
+        """All frames so far; error frames, and frames that hold no numbers, among them."""
+
+    def of_messages(self, messages: list[can.Message]) -> Raw:
+        """Return messages of python-can; error and remote frames have no data and are left out."""
+        t, keys, places, length, chunks = [], [], [], [], []
+        wanted, longest = self._wanted, self._longest
+        self.total += len(messages)
+        for message in messages:
+            self.errors += message.is_error_frame
+            if message.is_error_frame or message.is_remote_frame:
                 continue
-            if not abs(message.timestamp) <= MAX_TIME_S:
-                raise ValueError("no time")
-            time, data = second_ns(message.timestamp), bytes(message.data[:longest])
-        except (TypeError, ValueError, OverflowError):
-            broken += 1
-            continue
-        t.append(time)
-        keys.append(key)
-        places.append(buses.setdefault(bus, len(buses)))
-        length.append(len(data))
-        chunks.append(data.ljust(longest, b"\0"))
-    numbers = (np.array(column, np.int64) for column in (t, keys, places, length))
-    return Raw._make(
-        (
-            *numbers,
-            np.frombuffer(bytearray().join(chunks), np.uint8).reshape(len(chunks), longest),
-            tuple(buses),
-            len(messages),
-        )
-    ), broken
+            try:
+                # A damaged database holds other types.
+                key = int(message.arbitration_id) & 0x1FFFFFFF
+                if message.is_extended_id:
+                    key |= EXTENDED
+                bus = message.channel
+                self.seen[bus, key] += 1
+                if wanted is not None and key not in wanted and group_of(key) not in wanted:
+                    continue
+                if not abs(message.timestamp) <= MAX_TIME_S:
+                    raise ValueError("no time")
+                time, data = second_ns(message.timestamp), bytes(message.data[:longest])
+            except (TypeError, ValueError, OverflowError):
+                self.broken += 1
+                continue
+            t.append(time)
+            keys.append(key)
+            places.append(self._buses.setdefault(bus, len(self._buses)))
+            length.append(len(data))
+            chunks.append(data.ljust(longest, b"\0"))
+        numbers = (np.array(column, np.int64) for column in (t, keys, places, length))
+        rows = np.frombuffer(bytearray().join(chunks), np.uint8).reshape(len(chunks), longest)
+        return Raw._make((*numbers, rows, tuple(self._buses), len(messages)))
+
+    def of_block(self, block: Raw) -> Raw:
+        """Return frames of a block with numbers of buses in place of positions."""
+        self.total += block.total
+        codes, counts = np.unique((block.bus << 32) + block.key, return_counts=True)
+        for code, count in zip(codes.tolist(), counts.tolist(), strict=True):
+            self.seen[code >> 32, code & 0xFFFFFFFF] += count
+        rows = wanted_rows(block.key, self._wanted)
+        numbers, inverse = np.unique(block.bus[rows], return_inverse=True)
+        places = [self._buses.setdefault(number, len(self._buses)) for number in numbers.tolist()]
+        data = np.zeros((rows.size, self._longest), np.uint8)
+        data[:, :8] = block.data[rows, : self._longest]
+        length = np.minimum(block.length[rows], self._longest)
+        bus = np.array(places, np.int64)[inverse]
+        return Raw(block.t[rows], block.key[rows], bus, length, data, tuple(self._buses), block.total)
 
 
-def _selected(
-    block: Raw,
-    wanted: frozenset[int] | None,
-    longest: int,
-    buses: dict[BusName, int],
-    seen: Counter[tuple[BusName, int]],
-) -> Raw:
-    """Return the wanted frames of a block; as `_columns`."""
-    codes, counts = np.unique((block.bus << 32) + block.key, return_counts=True)
-    for code, count in zip(codes.tolist(), counts.tolist(), strict=True):
-        seen[code >> 32, code & 0xFFFFFFFF] += count
-    rows = np.arange(block.key.size) if wanted is None else np.flatnonzero(is_wanted(block.key, wanted))
-    numbers, inverse = np.unique(block.bus[rows], return_inverse=True)
-    places = np.array([buses.setdefault(number, len(buses)) for number in numbers.tolist()], np.int64)
-    data = np.zeros((rows.size, longest), np.uint8)
-    data[:, :8] = block.data[rows, :longest]
-    length = np.minimum(block.length[rows], longest)
-    return Raw(block.t[rows], block.key[rows], places[inverse], length, data, tuple(buses), block.total)
-
-
-def _missing_end(path: Path, reader: can.io.MessageReader) -> str:
+def _missing_end(path: Path, reader: can.io.MessageReader, lines: _Lines | None) -> str:
     """Return why a file that was read without a fault is incomplete, or an empty text."""
     if isinstance(reader, can.BLFReader):
         size = path.stat().st_size
@@ -340,11 +322,7 @@ def _missing_end(path: Path, reader: can.io.MessageReader) -> str:
         page, pages = int.from_bytes(header[16:18], "big"), int.from_bytes(header[28:32], "big")
         size, whole = path.stat().st_size, (65536 if page == 1 else page) * pages
         return f"{size} of {whole} bytes are there" if whole > size else ""
-    if path.suffix.lower() in (".asc", ".csv", ".log", ".trc", ".txt"):
-        with path.open("rb") as file:
-            file.seek(-1, os.SEEK_END)
-            return "" if file.read(1) in (b"\n", b"\r") else "its last line is incomplete"
-    return ""
+    return "its last line is incomplete" if lines and lines.incomplete else ""
 
 
 EXTENDED = 1 << 31
@@ -353,23 +331,29 @@ EXTENDED = 1 << 31
 GROUP = 1 << 30
 """Added to a parameter group of J1939 in place of an id: priority and addresses are zero."""
 
-GROUP_BITS = 0x83FF0000, 0x83FFFF00
-"""Bits of an id that name its parameter group: of formats below 240, whose next byte is an address, and of others."""
+Ids = TypeVar("Ids", int, np.ndarray)
+"""An id, or several."""
 
 
-def group_of(key: int) -> int:
+def group_bits(key: Ids) -> Ids:
+    """Return the bits of an id that name its parameter group; below format 240 the next byte is an address."""
+    return 0x3FF0000 | 0xFF00 * (key >> 16 & 0xFF >= 240)
+
+
+def group_of(key: Ids) -> Ids:
     """Return the parameter group of an id with EXTENDED; of any other id a number that no wanted one has."""
-    return key & GROUP_BITS[key >> 16 & 0xFF >= 240] | GROUP
+    return key & (EXTENDED | group_bits(key)) | GROUP
 
 
-def is_wanted(key: np.ndarray, wanted: frozenset[int]) -> np.ndarray:
-    """Return which ids (n,) are wanted, by themselves or by their parameter group."""
+def wanted_rows(key: np.ndarray, wanted: frozenset[int] | None) -> np.ndarray:
+    """Return the places of the ids (n,) that are wanted, by themselves or by their parameter group; None is all."""
+    if wanted is None:
+        return np.arange(key.size)
     listed = list(wanted)
     found = np.isin(key, listed)
     if any(item & GROUP for item in listed):
-        groups = np.where(key >> 16 & 0xFF >= 240, key & GROUP_BITS[1], key & GROUP_BITS[0]) | GROUP
-        found |= np.isin(groups, listed)
-    return found
+        found |= np.isin(group_of(key), listed)
+    return np.flatnonzero(found)
 
 
 CHUNK_FRAMES = 8192  # Frames of a chunk

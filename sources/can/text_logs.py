@@ -52,18 +52,13 @@ MONTHS = ("jan", "feb", "m.r|mrz", "apr", "ma[iy]", "jun", "jul", "aug", "sep", 
 
 log = logging.getLogger("can.text_logs")  # One of python-can's, whose warnings become the fault of a file
 
-Parse = Callable[[str], can.Message | None]
-"""Return the frame of a line; None if it has none."""
-
 
 def is_frames(path: Path) -> bool:
     """Return whether a file that ends as a table does (.csv, .txt) is a log of frames, by its first lines."""
     try:
-        lines = _head(path)
+        return _form(_head(path)) is not None
     except OSError:
         return False  # It is reported when the file is read.
-    names = lines[0].lower().replace(" ", "").split(",")[:2] if lines else []
-    return names == ["timestamp", "arbitration_id"] or _form(lines) is not None
 
 
 def open_text_log(path: Path, zone: str | None) -> TextIOMessageReader | None:
@@ -79,12 +74,12 @@ def open_text_log(path: Path, zone: str | None) -> TextIOMessageReader | None:
     kind = suffix_of(path)
     lines = _head(path) if kind in (".csv", ".log", ".txt") else []
     form = _form(lines)
-    if kind != ".asc" and form is None:
-        if lines and "***BUSMASTER" in lines[0]:
-            raise SourceError(f"{path}: is a log of BUSMASTER; convert it to ASC there (Format Converters, Log to ASC)")
+    if lines and "***BUSMASTER" in lines[0]:
+        raise SourceError(f"{path}: is a log of BUSMASTER; convert it to ASC there (Format Converters, Log to ASC)")
+    if kind != ".asc" and form in (None, can.CSVReader):
         return None
     file: TextIO = gzip.open(path, "rt") if path.suffix.lower() == ".gz" else path.open()  # type: ignore[assignment]
-    if form is None:
+    if kind == ".asc":
         return AscLog(file, zone)
     return TextLog(file, ColumnLines(lines[0]) if form is ColumnLines else CandumpLines(path, lines, zone))
 
@@ -97,9 +92,11 @@ def _head(path: Path) -> list[str]:
 
 
 def _form(lines: list[str]) -> type | None:
-    """Return the class that reads lines which begin with these."""
-    names = set(_cells(lines[0])) if lines else set()
-    if set(GVRET) <= names or set(CANEDGE) <= names:
+    """Return the class that reads lines which begin with these, if it is known."""
+    names = _cells(lines[0]) if lines else []
+    if names[:2] == ["timestamp", "arbitration_id"]:
+        return can.CSVReader
+    if set(GVRET) <= set(names) or set(CANEDGE) <= set(names):
         return ColumnLines
     return CandumpLines if any(CONSOLE.fullmatch(_plain(line)) for line in lines[:5]) else None
 
@@ -123,17 +120,23 @@ def _stamp(zone: str | None, at: datetime) -> float:
 
 
 class TextLog(TextIOMessageReader):
-    """Reader of a log with a frame a line, as those of python-can."""
+    """Reader of a log with a frame a line, as those of python-can; `parse` returns the frame, None if there is none."""
 
-    def __init__(self, file: TextIO, parse: Parse) -> None:
-        super().__init__(file, mode="r")
-        self.parse = parse
+    def __init__(self, file: TextIO, parse: Callable[[str], can.Message | None]) -> None:
+        super().__init__(file)
+        self._parse = parse
 
     def __iter__(self) -> Iterator[can.Message]:
-        for line in self.file:
-            message = self.parse(line)
-            if message is not None:
-                yield message
+        return filter(None, map(self._parse, self.file))
+
+
+def _frame(
+    time: float, key: str, extended: bool, bus: int | str, size: int, data: bytes, remote: bool, error: bool = False
+) -> can.Message:
+    if len(data) != size and not remote:
+        raise ValueError(f"it has {len(data)} of {size} bytes")
+    number = int(key, 16) & 0x1FFFFFFF
+    return can.Message(time, number, extended, remote, error, bus, data=data, is_fd=size > 8)
 
 
 class ColumnLines:
@@ -153,19 +156,11 @@ class ColumnLines:
             return None
         cells = line.split(self._delimiter)
         time, key, extended, bus, count, first = self._places
-        size, remote = int(cells[count]), self._remote is not None and cells[self._remote] == "1"
+        size, long = int(cells[count]), cells[extended].lower() in ("true", "1")
+        t = int(cells[time]) / 1e6 if self._gvret else float(cells[time])
         data = bytes.fromhex(" ".join(cells[first : first + size]) if self._gvret else cells[first])
-        if len(data) != size and not remote:
-            raise ValueError(f"it has {len(data)} of {size} bytes")
-        return can.Message(
-            timestamp=int(cells[time]) / 1e6 if self._gvret else float(cells[time]),
-            arbitration_id=int(cells[key], 16),
-            is_extended_id=cells[extended].lower() in ("true", "1"),
-            is_remote_frame=remote,
-            is_fd=size > 8,
-            channel=int(cells[bus]),
-            data=data,
-        )
+        remote = self._remote is not None and cells[self._remote] == "1"
+        return _frame(t, cells[key], long, int(cells[bus]), size, data, remote)
 
 
 class CandumpLines:
@@ -181,11 +176,9 @@ class CandumpLines:
         remedy = "record with candump -L"
         if None in found:
             raise SourceError(f"{path}: it is console output of candump without times; {remedy}, or with -ta")
-        if "-" in found[0]:
+        if "-" in found[0] or float(found[0]) > DATED_S:
             return
         times = np.array([float(text) for text in found])
-        if times[0] > DATED_S:
-            return
         # Differences rise and fall, or are all the same; times from the first frame rise, but for those of another bus.
         travel = float(np.abs(np.diff(times[1:])).sum())
         rise = float(times[-1] - times[1]) / travel if travel else 0.0
@@ -205,21 +198,10 @@ class CandumpLines:
             time = _stamp(self._zone, datetime.fromisoformat(match["time"].strip()))
         else:
             time = self._t = float(match["time"]) + self._t * self._sums
-        size, rest, key = int(match["size"]), match["data"], int(match["id"], 16)
-        remote = "remote request" in rest
+        size, rest, key = int(match["size"]), match["data"], match["id"]
+        remote, error = "remote request" in rest, rest.endswith("ERRORFRAME")
         data = b"" if remote else bytes.fromhex(rest.strip()[: max(0, 3 * size - 1)])
-        if len(data) != size and not remote:
-            raise ValueError(f"it has {len(data)} of {size} bytes")
-        return can.Message(
-            timestamp=round(time, 6),
-            arbitration_id=key & 0x1FFFFFFF,
-            is_extended_id=len(match["id"]) > 3,
-            is_error_frame=rest.rstrip().endswith("ERRORFRAME"),
-            is_remote_frame=remote,
-            is_fd=size > 8,
-            channel=match["bus"],
-            data=data,
-        )
+        return _frame(round(time, 6), key, len(key) > 3, match["bus"], size, data, remote, error)
 
 
 class AscLog(can.ASCReader):

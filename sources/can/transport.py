@@ -14,7 +14,7 @@ from dataclasses import dataclass, field
 import numpy as np
 
 from ..source import Report
-from .readers import EXTENDED, BusName, Raw, group_of, is_wanted
+from .readers import EXTENDED, BusName, Raw, group_of, wanted_rows
 
 MANAGEMENT, TRANSFER = (group_of(EXTENDED | form << 16) for form in (0xEC, 0xEB))
 TRANSPORT = frozenset((MANAGEMENT, TRANSFER))
@@ -60,23 +60,19 @@ class Transport:
             t: Its time, ns.
             data: Its bytes.
         """
-        group = group_of(key)
-        if group not in TRANSPORT or len(data) < 8:
-            return None
-        source, destination = key & 0xFF, key >> 8 & 0xFF
-        pair = (bus, source, destination)
-        if group == MANAGEMENT:
+        group, pair = group_of(key), (bus, key & 0xFF, key >> 8 & 0xFF)
+        if group == MANAGEMENT and len(data) >= 8:
             self._manage(pair, key, t, data)
-            return None
-        session = self._open.get(pair)
+        session = self._open.get(pair) if group == TRANSFER and len(data) >= 8 else None
         if session is None:
             return None
-        late = t - session.last > TIMEOUTS_NS[destination == ALL]
-        if late or data[0] > session.count or (destination == ALL and data[0] != len(session.packets) + 1):
+        to_all, number = pair[2] == ALL, data[0]
+        late = t - session.last > TIMEOUTS_NS[to_all]
+        if late or not 1 <= number <= session.count or (to_all and number != len(session.packets) + 1):
             self._drop(pair)
             return None
         session.last = t
-        session.packets[data[0]] = data[1:8]
+        session.packets[number] = data[1:8]
         if len(session.packets) < session.count:
             return None
         del self._open[pair]
@@ -90,14 +86,13 @@ class Transport:
         rows, longest = np.array([row for row, *_ in found]), raw.data.shape[1]
         keys, parts = [key for _, _, key, _ in found], [data[:longest] for *_, data in found]
         content = np.frombuffer(b"".join(part.ljust(longest, b"\0") for part in parts), np.uint8).reshape(-1, longest)
-        added = raw.t[rows], np.array(keys), raw.bus[rows], np.array([*map(len, parts)]), content
-        order = np.argsort(np.append(np.arange(raw.t.size), rows), kind="stable")
-        columns = (np.concatenate(pair)[order] for pair in zip(raw[:5], added, strict=True))
+        added = raw.t[rows], keys, raw.bus[rows], [*map(len, parts)], content
+        columns = (np.insert(column, rows + 1, new, axis=0) for column, new in zip(raw[:5], added, strict=True))
         return Raw._make((*columns, raw.buses, raw.total))
 
     def take_all(self, raw: Raw) -> Iterator[tuple[int, BusName, int, bytes]]:
         """Yield row of the last packet, bus, id and bytes of each message that frames of a log complete."""
-        for row in np.flatnonzero(is_wanted(raw.key, TRANSPORT)).tolist():
+        for row in wanted_rows(raw.key, TRANSPORT).tolist():
             bus, data = raw.buses[raw.bus[row]], raw.data[row, : raw.length[row]].tobytes()
             if whole := self.take(bus, int(raw.key[row]), int(raw.t[row]), data):
                 yield row, bus, *whole

@@ -3,14 +3,13 @@
 import re
 import struct
 import zlib
-from collections import Counter
 
 import can
 import numpy as np
 import pytest
 
 from sources.can.blf import BlfBlocks
-from sources.can.readers import LogSummary, _columns, _correct_readers, read_messages
+from sources.can.readers import Columns, LogSummary, _correct_readers, read_messages
 from tests.cases import cases
 
 START = 1_700_000_000.0
@@ -66,13 +65,13 @@ def check(path, wanted=None, longest=8):
     _correct_readers()
     with can.BLFReader(path) as reader:
         messages = list(reader)
-    seen = Counter()
-    expected, _ = _columns(messages, wanted, longest, {}, seen)
+    own = Columns(wanted, longest)
+    expected = own.of_messages(messages)
     columns, buses, summary, total = read(path, wanted, longest)
     for got, name in zip(columns, ("t", "key", "length", "data"), strict=True):
         np.testing.assert_array_equal(got, getattr(expected, name), err_msg=name)
     assert buses == [expected.buses[place] for place in expected.bus.tolist()]
-    assert (summary.seen, total) == (seen, len(messages))
+    assert (summary.seen, total) == (own.seen, len(messages))
     with BlfBlocks(path) as reader:
         return list(reader)
 
