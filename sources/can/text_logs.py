@@ -252,7 +252,7 @@ class AscLog(can.ASCReader):
 
     def _process_classic_can_frame(self, line: str, msg_kwargs: dict[str, Any]) -> can.Message:
         # The first word may be a symbolic name.
-        if "ID = " in line and (match := re.search(r"\bID = (\d+)(x?)", line)):
+        if "ID = " in line and (match := re.search(r"^(?!\s*errorframe).*\bID = (\d+)(x?)", line, re.IGNORECASE)):
             number = f"{int(match[1]):x}" if self._converted_base == 16 else match[1]
             line = re.sub(r"^\s*\S+", number + match[2], line)
         return super()._process_classic_can_frame(line, msg_kwargs)

@@ -6,6 +6,7 @@ import pytest
 
 from estimators.errors import SourceError
 from sources.can.log import CanLog
+from sources.can.readers import LogSummary, read_messages
 from sources.inspect import inspect_recordings, is_table
 from sources.tables.times import TimeColumn
 from tests.sources.can.can_tools import Reports
@@ -209,7 +210,9 @@ def test_a_symbolic_name_in_place_of_an_id_is_its_id(tmp_path):
         HEADER.format(date="Sat Sep 30 15:06:13.191 2017")
         + f"   0.010000 1  EngineData      Rx   d 2 F4 01{tail.format(256)}\n"
         + f"   0.020000 1  Dead            Rx   d 2 F4 01{tail.format('257x')}\n"
+        + "   0.030000 2 ErrorFrame Flags = 0xe CodeExt = 0x20a2 Code = 0x82 ID = 0 DLC = 0 Position = 5 Length = 113\n"
     )
+    assert [item.fault for item in read_messages(path, None, 8) if isinstance(item, LogSummary)] == [""]
     assert [item[:3] for item in keys_and_times(path)[0]] == [(0, 256, 0), (0, 257, 1)]
     got = read_all(CanLog([path], decoder_of(tmp_path)))
     assert got.value[:, 0].tolist() == [10.0]
