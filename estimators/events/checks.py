@@ -6,8 +6,8 @@ without one are checked by the fold.
 
 from __future__ import annotations
 
+from contextlib import suppress
 from functools import lru_cache
-from threading import Lock
 
 import numpy as np
 from numba import types
@@ -85,16 +85,12 @@ def _look(t, kind, channel, value, width, rows, nu, nx):
     return 0, FINE, infinite
 
 
-_compiling = Lock()
-
-
 @lru_cache(maxsize=1)
 def _looking() -> CPUDispatcher:
     """Return `_look`, compiled for its only signature, which also accepts writable arrays."""
-    with _compiling:  # The cache has no lock.
-        if not _look.signatures:
-            _look.compile(_signature.args)
-            _look.disable_compile()
+    with suppress(RuntimeError):  # Another thread was first, and has disabled it: the cache has no lock.
+        _look.compile(_signature.args)
+    _look.disable_compile()
     return _look
 
 
