@@ -5,7 +5,6 @@ from __future__ import annotations
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
-from threading import Lock
 from types import ModuleType
 from typing import NamedTuple
 
@@ -112,26 +111,21 @@ def check_windows(sensors: Sequence[Reads], end: int) -> list[tuple[int, int]]:
 
 
 class ModelFiles:
-    """Models of states as the draft's Python file has them; those with the same functions share their compiled code.
-
-    Threads may share it.
-    """
+    """Models of states as the draft's Python file has them; those with the same functions share their compiled code."""
 
     def __init__(self, folder: Path) -> None:
         """Write the files of functions to a folder, which must outlive their use."""
         self._folder = folder
-        self._lock = Lock()
         self._functions: dict[str, ModuleType] = {}
 
     def model(self, states: Sequence[Moves], inputs: Sequence[tuple[str, Signal]]) -> StateSpaceModel:
         """Return the model of some states."""
         drafted = DraftPlan(tuple(states), tuple(inputs), tuple(item.signal for item in states), ())
         functions, begin, declaration = python_text("draft", "DraftState", drafted).partition("\nDraftState = ")
-        with self._lock:
-            if functions not in self._functions:
-                path = self._folder / f"draft_{len(self._functions)}.py"
-                path.write_text(functions, encoding="utf-8")
-                self._functions[functions] = run_file(path.stem, path)
+        if functions not in self._functions:
+            path = self._folder / f"draft_{len(self._functions)}.py"
+            path.write_text(functions, encoding="utf-8")
+            self._functions[functions] = run_file(path.stem, path)
         names = dict(vars(self._functions[functions]))
         exec(begin + declaration, names)
         model: StateSpaceModel = names["DraftState"]

@@ -7,10 +7,8 @@ fitted as `nisus tune` does, and the structure of the highest likelihood is kept
 
 from __future__ import annotations
 
-import os
 import tempfile
 from collections.abc import Callable, Generator, Iterable, Iterator, Mapping, Sequence
-from concurrent.futures import Future, ThreadPoolExecutor
 from contextlib import suppress
 from dataclasses import replace
 from functools import partial
@@ -252,19 +250,14 @@ def _fit_split(drafted: DraftPlan, split: Turns, progress: FitProgress) -> Gener
     drafted = replace(drafted, states=tuple(_scaled_on(item, split) for item in drafted.states))
     with tempfile.TemporaryDirectory() as name:
         files = ModelFiles(Path(name))
-        # The folds, nearly all of the work, run without the lock of the interpreter.
-        with ThreadPoolExecutor(os.cpu_count()) as pool:
-            begun: list[Future[list[FittedStructure | None]] | None] = []
-            early: list[int] = []  # readings in the fitted parts
-            for item in drafted.states:
-                inputs = [each for each in drafted.inputs if each[0] in item.inputs]
-                early.append(sum(int(split.fitted(reads.signal.series.t).sum()) for reads in item.sensors))
-                able = early[-1] >= MIN_VALUES and not progress.stop
-                begun.append(pool.submit(fitted, item, inputs, split, span, files, progress) if able else None)
-            choices: list[list[FittedStructure | None]] = []
-            for k, (item, future) in enumerate(zip(drafted.states, begun, strict=True)):
-                yield DraftStep(f"fitting {item.name}, {k + 1} of {len(drafted.states)} states")
-                choices.append([] if future is None else future.result())
+        choices: list[list[FittedStructure | None]] = []
+        early: list[int] = []  # readings in the fitted parts
+        for k, item in enumerate(drafted.states):
+            yield DraftStep(f"fitting {item.name}, {k + 1} of {len(drafted.states)} states")
+            inputs = [each for each in drafted.inputs if each[0] in item.inputs]
+            early.append(sum(int(split.fitted(reads.signal.series.t).sum()) for reads in item.sensors))
+            able = early[-1] >= MIN_VALUES and not progress.stop
+            choices.append(fitted(item, inputs, split, span, files, progress) if able else [])
         tried: list[DraftFold] = []
         for k, one in enumerate(_combined(drafted, choices)):
             if not tried or not progress.stop:
