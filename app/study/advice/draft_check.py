@@ -94,7 +94,7 @@ def log_of(
     return log
 
 
-MAX_CHECKED_READINGS = 200_000  # readings of all sensors that a fold takes, in windows over the recording
+MAX_CHECKED_READINGS = 100_000  # readings of all sensors that a fold takes, in windows over the recording
 CHECK_WINDOWS = 16  # windows, if there are more readings
 
 

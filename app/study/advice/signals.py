@@ -157,7 +157,7 @@ def _kind(series: SignalSeries, levels: np.ndarray) -> str:
         return "huge"
     if levels.size <= MAX_SWITCH_LEVELS:
         return "switch"
-    if SKIPPED.search(series.name) or _counts_time(series):
+    if SKIPPED.search(series.name) or _counts(series):
         return "counter"
     return "signal"
 
@@ -166,8 +166,13 @@ CLOCK_RATES = (1.0, 1e3, 1e6, 1e9, 1 / 60.0, 1 / 3600.0, 1 / 86400.0)
 """Units of a clock per second: s, ms, us, ns, min, h, days."""
 
 
-def _counts_time(series: SignalSeries) -> bool:
-    """Return whether a signal is a clock: it grows at the rate of a unit of time, within a thousandth."""
+MIN_UNIT_STEPS = 0.9  # Of the steps of a counter, which may start over, as one of four bits
+
+
+def _counts(series: SignalSeries) -> bool:
+    """Return whether a signal is a clock or numbers the rows: its rate is a unit of time, or its steps are 1."""
+    if np.mean(np.diff(series.values) == 1.0) > MIN_UNIT_STEPS:
+        return True
     seconds = (series.t - series.t[0]) * 1e-9
     if not np.ptp(seconds) > 0.0:
         return False

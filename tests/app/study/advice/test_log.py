@@ -43,6 +43,14 @@ def test_a_clock_is_no_signal_and_three_times_at_one_interval_are_not_needed():
     when = np.round(t * 1e9).astype(np.int64)
     assert signal(None, SignalSeries("a", "", when, 5e5 + np.round(1e3 * t))).kind == "counter"
     assert signal(None, SignalSeries("a", "", when, 2.0 * t)).kind == "signal"
+    # Numbers of the rows, a counter of four bits, and whole numbers that wander.
+    rows = np.arange(300.0)
+    for values, kind in (
+        (rows + 7.0, "counter"),
+        (rows % 16, "counter"),
+        (np.cumsum(rng.integers(-1, 3, 300)), "signal"),
+    ):
+        assert signal(None, SignalSeries("a", "", when, values)).kind == kind
     # Pairs of rows, a quarter of a second and then some seconds apart: no two successive intervals are alike.
     pairs = np.cumsum(np.where(np.arange(300) % 2, 0.25, rng.uniform(3.0, 5.0, 300)))
     walk = SignalSeries("a", "", np.round(pairs * 1e9).astype(np.int64), np.cumsum(rng.normal(0, 1, 300)))
