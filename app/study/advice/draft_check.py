@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
@@ -14,7 +15,7 @@ from estimators.diagnostics.consistency import NisVerdict
 from estimators.diagnostics.intervals import Interval, correlation_interval, share_interval
 from estimators.diagnostics.score import MAX_NIS_FACTOR, nis_verdict
 from estimators.fold import Fold, folded
-from estimators.log import READING, Log
+from estimators.log import READING, RESET, Events, Log
 from estimators.model.coloured import ColouredError, coloured
 from estimators.model.state_space import StateSpaceModel
 from estimators.model.user_file import run_file
@@ -76,10 +77,13 @@ def log_of(
 ) -> Log:
     """Return the readings of sensors and the inputs in windows from one time to another, ns; seconds count from `zero`.
 
-    The windows are in order and do not overlap.
+    The windows are in order and do not overlap. Each begins with the prior.
     """
     log = Log.of(model, start=(windows[0][0] - zero) * 1e-9)
     for begin, end in windows:
+        if begin > windows[0][0]:
+            before = begin - zero - 1
+            log.extend(Events.one(before, before, RESET, 0, [], log.width))
         for name, one in inputs:
             t = one.series.t
             # The value that holds at the begin is an event of the window as well.
@@ -121,7 +125,11 @@ class ModelFiles:
     def model(self, states: Sequence[Moves], inputs: Sequence[tuple[str, Signal]]) -> StateSpaceModel:
         """Return the model of some states."""
         drafted = DraftPlan(tuple(states), tuple(inputs), tuple(item.signal for item in states), ())
-        functions, begin, declaration = python_text("draft", "DraftState", drafted).partition("\nDraftState = ")
+        text = python_text("draft", "DraftState", drafted)
+        for k, reads in enumerate(drafted.sensors):  # What differs in its name alone is compiled once.
+            text = re.sub(rf"\b(read_|Measurement of ){reads.name}\b", rf"\g<1>{k}", text)
+        functions, begin, declaration = text.partition("\nDraftState = ")
+        functions = re.sub(" +# .*", "", functions)
         if functions not in self._functions:
             path = self._folder / f"draft_{len(self._functions)}.py"
             path.write_text(functions, encoding="utf-8")

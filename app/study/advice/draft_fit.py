@@ -166,10 +166,10 @@ def _fit(
         tuning = with_options(Tuning.of(larger), options)
         keys, bounds = _keys(item, noise, structure, span, period, tuning)
         zero = int(min(reads.signal.series.t[0] for reads in item.sensors))
-        logs = [log_of(larger, item.sensors, inputs, [window], zero) for window in windows_of(item, split)]
-        entries, _ = entries_of("kf", tuning, logs, keys, bounds)
-        recordings = tuple(Recording(log, 1.0, np.zeros(log.n, bool)) for log in logs)
-        objective = Objective("kf", tuning, tuple(entries), recordings, go=counted, progress=progress)
+        log = log_of(larger, item.sensors, inputs, windows_of(item, split), zero)
+        entries, _ = entries_of("kf", tuning, [log], keys, bounds)
+        recording = Recording(log, 1.0, np.zeros(log.n, bool))
+        objective = Objective("kf", tuning, tuple(entries), (recording,), go=counted, progress=progress)
         x, value = scaled_rounds(objective, objective.start, rounds=ROUNDS)
     except NisusError:
         return None

@@ -211,11 +211,11 @@ def plan(found: RecordingContents, roles: Roles) -> DraftPlan:
             raise ConfigError(f"{part.files[0]}: its {part.t.size:,} times are all the same; {column}record it again")
     given = _given(roles, found, every)
     named = {id(one) for one, _ in given}
-    computed: dict[int, str] = {}
+    thin: dict[int, Signal] = {}
     free = (
         []
         if roles.sensors or roles.signals or roles.states
-        else _finest(found, [one for one in every if id(one) not in named], computed)
+        else _finest(found, [one for one in every if id(one) not in named], thin)
     )
     # Of several sensors of one quantity the first is the state, so held-out signals come last.
     order = {STATE: 0, HELD_OUT: 2}
@@ -227,7 +227,7 @@ def plan(found: RecordingContents, roles: Roles) -> DraftPlan:
     if free:
         more = [one for one in every if id(one) not in named and not any(one is other for other in picked)]
         picked += _same_quantity(more, [one for k, one in enumerate(picked) if k not in inputs])
-    raw, few = picked, [one if k in inputs else thinned(one) for k, one in enumerate(picked)]
+    raw, few = picked, [one if k in inputs else thin.get(id(one)) or thinned(one) for k, one in enumerate(picked)]
     for one, (_, role) in zip(few, places, strict=False):
         if interpolated(one) and role != INPUT:
             raise ConfigError(
@@ -268,6 +268,7 @@ def plan(found: RecordingContents, roles: Roles) -> DraftPlan:
             )
     rest = "has no role" if not free else f"not among the {MAX_SIGNALS} signals with most different values"
     known = {id(one): found for one, found in zip(raw, picked, strict=True)}
+    computed = {key: one.repeats.reason for key, one in thin.items() if interpolated(one)}
     found_roles = [
         _role(one, known.get(id(one)), picked, names, states, used, held_out, computed.get(id(one), rest))
         for one in every
@@ -445,21 +446,19 @@ def reads_of(name: str, lead: Signal, one: Signal, pair: Pair) -> Reads:
     return Reads(name, one, r, pair.gain, pair.offset)
 
 
-def _finest(found: RecordingContents, every: Sequence[Signal], computed: dict[int, str]) -> list[Signal]:
-    """Those of the most levels, in the order of the recording; interpolated ones are `computed`, with the reason."""
+def _finest(found: RecordingContents, every: Sequence[Signal], thin: dict[int, Signal]) -> list[Signal]:
+    """Those of the most levels, in the order of the recording, without interpolated ones; `thin` are those thinned."""
     fine = [one for one in every if one.kind == "signal"] or [
         one for one in every if one.kind == "switch" and one.levels > 2
     ]
     kept: list[int] = []
     for k in sorted(range(len(fine)), key=lambda k: (-fine[k].levels, k)):
         if len(kept) < MAX_SIGNALS:
-            one = thinned(fine[k])
-            if interpolated(one):
-                computed[id(fine[k])] = one.repeats.reason
-            else:
+            one = thin[id(fine[k])] = thinned(fine[k])
+            if not interpolated(one):
                 kept.append(k)
-    if not kept and computed:
-        reasons = ", ".join(f"{one.name}: {computed[id(one)]}" for one in fine)
+    if not kept and thin:
+        reasons = ", ".join(f"{one.name}: {thin[id(one)].repeats.reason}" for one in fine)
         raise ConfigError(f"{found.files[0]}: no signal has measurements; {reasons}")
     if not kept:
         longest = max((one.series.values.size for one in every), default=0)

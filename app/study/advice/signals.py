@@ -299,11 +299,10 @@ def common(series: Sequence[SignalSeries]) -> tuple[np.ndarray, np.ndarray]:
 
 
 def _mean(series: SignalSeries, edges: np.ndarray, middles: np.ndarray, gap: float) -> np.ndarray:
-    which = np.searchsorted(edges, series.t, side="right") - 1
-    inside = (which >= 0) & (which < middles.size)
-    count = np.bincount(which[inside], minlength=middles.size)
+    places = np.searchsorted(series.t, np.ceil(edges).astype(np.int64))
+    count = np.diff(places)
     with np.errstate(all="ignore"):
-        mean = np.bincount(which[inside], weights=series.values[inside], minlength=middles.size) / count
+        mean = np.add.reduceat(np.append(series.values, 0.0), places)[:-1] / count
     line = np.interp(middles, series.t, series.values)
     after = np.clip(np.searchsorted(series.t, middles), 1, series.t.size - 1)
     line[series.t[after] - series.t[after - 1] > gap] = np.nan

@@ -7,14 +7,17 @@ import numpy as np
 import pytest
 
 from app.study.advice.draft import python_text
+from app.study.advice.draft_check import ModelFiles, log_of
 from app.study.advice.draft_fit import fit_all
-from app.study.advice.plan import OMITTED, Roles, plan
+from app.study.advice.plan import OMITTED, Moves, Reads, Roles, plan
 from app.study.advice.relations import driven
 from app.study.advice.signals import signal
 from app.twin.log_reader import read_log
 from app.twin.twin import load_twin
 from estimators.fit.objective import FitProgress
+from estimators.fold import folded
 from estimators.log import READING
+from estimators.tuning import Tuning
 from sources.inspect import RecordingContents, SignalSeries, inspect_recordings
 
 N = 3000
@@ -176,8 +179,25 @@ def test_a_long_recording_is_checked_in_windows():
     assert (
         check.fitted_to == "Fitted to the first 6.94 h, checked on the other 6.94 h (in 16 windows over the recording)"
     )
-    assert check.sensors[0].n == 8 * 12_500
+    assert check.sensors[0].n == 8 * 6_250
     assert check.sensors[0].coverage.value == pytest.approx(0.95, abs=0.005)
+
+
+def test_windows_of_one_log_are_folded_as_logs_of_their_own(tmp_path):
+    """The log-likelihood of two windows, far from each other, is the sum of those of a log of each."""
+    t = np.arange(1000) * 10**8
+    values = np.cumsum(np.random.default_rng(4).normal(0.0, 0.2, 1000))
+    one = signal(None, SignalSeries("level", "m", t, values))
+    reads = Reads("level", one, 0.01)
+    item = Moves("level", one, False, 0.4, (reads,))
+    model = ModelFiles(tmp_path).model([item], [])
+    windows = [(0, 100 * 10**8), (700 * 10**8, 900 * 10**8)]
+
+    def density(*parts: tuple[int, int]) -> float:
+        fold = folded("kf", model, Tuning.of(model), log_of(model, [reads], [], parts, 0))
+        return float(np.nansum(fold.track.log_likelihood))
+
+    assert density(*windows) == pytest.approx(sum(map(density, windows)), abs=1e-6)
 
 
 def test_a_coarse_sensor_of_a_state_that_follows_an_input_has_an_offset_beside_the_lag(tmp_path, nisus):
