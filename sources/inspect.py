@@ -22,9 +22,9 @@ from .can.log import CanLog, check_log, frames_reader
 from .can.readers import BusName, LogSummary, Raw
 from .can.text_logs import DATED_S, is_frames
 from .can.transport import Transport
+from .dates import CLOCK, is_day
 from .formats import CAN_LOGS, EITHER, check_once, check_present, holds_signals, suffix_of
 from .source import UNDATED, Channel, ignore
-from .tables.dates import CLOCK, is_day
 from .tables.dialect import DETECTED, QUALITY_WORD, TIME_NAME, TIME_NAMES, Dialect
 from .tables.order import Order, time_order
 from .tables.rows import TableRows, cells_of, format_of, names_of, remarks_of, rows_of

@@ -16,9 +16,9 @@ import numpy as np
 from estimators.errors import is_blank, nearest, quoted, shown_name
 from estimators.log import Events
 
+from .dates import ns_of_iso
 from .mapping import ABSENT, PRESENT, ChannelMapping
 from .source import AssetEvents, Channel, Numbers, Report, ignore
-from .tables.dates import ns_of_iso
 from .tables.text import TextMatch, column_of, no_value
 
 ACCEPTED, DUPLICATE, REFUSED = "accepted", "duplicate", "refused"

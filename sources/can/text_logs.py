@@ -22,6 +22,7 @@ from can.io.generic import TextIOMessageReader
 
 from estimators.errors import SourceError
 
+from ..dates import ns_of_date, ns_of_iso
 from ..formats import open_binary, suffix_of
 
 HEAD_BYTES = 65_536  # Bytes from which the form of a log is detected
@@ -45,10 +46,6 @@ FD_LINE = re.compile(
     re.IGNORECASE,
 )
 """A CAN FD frame of an ASC log: channel, direction and id; symbolic name; flags, DLC, length and data."""
-
-DATE = re.compile(r"(\S+)\s+(\d+)\s+(\d+):(\d+):(\d+)(?:[.:](\d+))?\s*(am|pm)?\s+(\d{4})", re.IGNORECASE)
-MONTHS = ("jan", "feb", "m.r|mrz", "apr", "ma[iy]", "jun", "jul", "aug", "sep", "o[ck]t", "nov", "de[cz]")
-"""Date of an ASC log, and the begins of its months in English and German; an umlaut may be unreadable."""
 
 log = logging.getLogger("can.text_logs")  # One of python-can's, whose warnings become the fault of a file
 
@@ -114,9 +111,10 @@ def _plain(line: str) -> str:
     return re.sub(r"\x1b\[[0-9;]*m", "", line).rstrip() if "\x1b" in line else line.rstrip()
 
 
-def _stamp(zone: str | None, at: datetime) -> float:
-    """Return the seconds since 1970 of a local time; a zone that is None is UTC."""
-    return at.replace(tzinfo=ZoneInfo(zone) if zone else UTC).timestamp()
+def _stamp(zone: str | None, t: int) -> float:
+    """Return the seconds since 1970 of a local time, ns; a zone that is None is UTC."""
+    local = datetime.fromtimestamp(t // 10**9, UTC)
+    return local.replace(tzinfo=ZoneInfo(zone) if zone else UTC).timestamp() + t % 10**9 * 1e-9
 
 
 class TextLog(TextIOMessageReader):
@@ -194,10 +192,9 @@ class CandumpLines:
         match = CONSOLE.fullmatch(line)
         if match is None or match["time"] is None:
             raise ValueError(f"it is no line of candump: {line[:40]}")
-        if "-" in match["time"]:
-            time = _stamp(self._zone, datetime.fromisoformat(match["time"].strip()))
-        else:
-            time = self._t = float(match["time"]) + self._t * self._sums
+        date = ns_of_iso(match["time"].strip())
+        time = _stamp(self._zone, date[0]) if date else float(match["time"]) + self._t * self._sums
+        self._t = time
         size, rest, key = int(match["size"]), match["data"], match["id"]
         remote, error = "remote request" in rest, rest.endswith("ERRORFRAME")
         data = b"" if remote else bytes.fromhex(rest.strip()[: max(0, 3 * size - 1)])
@@ -239,16 +236,14 @@ class AscLog(can.ASCReader):
         )
 
     def _seconds(self, text: str) -> float:
-        match = DATE.search(text)
-        month = next((k for k, name in enumerate(MONTHS, 1) if match and re.match(name, match[1].lower())), 0)
-        if match is None or not month:
+        # In German a month may be Mär, whose umlaut may be unreadable.
+        texts = text.strip(), re.sub(r"\bm.r", "mar", text.strip().partition(" ")[2], flags=re.IGNORECASE)
+        date = next(filter(None, (ns_of_date(one, False) for one in texts)), None)
+        if date is None:
             log.warning("its date %r cannot be read; times do not count from 1970", text.strip())
             return self.start_time
-        _, day, hour, minute, second, fraction, half, year = match.groups()
-        hours = int(hour) % 12 + 12 * (half.lower() == "pm") if half and int(hour) <= 12 else int(hour)
-        at = datetime(int(year), month, int(day), hours, int(minute), int(second))
         self._dated = True
-        return _stamp(self._zone, at) + float(f"0.{fraction or 0}")
+        return _stamp(self._zone, date[0])
 
     def _process_classic_can_frame(self, line: str, msg_kwargs: dict[str, Any]) -> can.Message:
         # The first word may be a symbolic name.

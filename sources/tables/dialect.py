@@ -14,6 +14,7 @@ from typing import NamedTuple
 
 from estimators.errors import SourceError, quoted
 
+from ..dates import CLOCK, layout, ns_of_iso
 from ..formats import refuse_others
 from ..units import heading_unit
 
@@ -315,11 +316,6 @@ _EXPONENT = r"(?:[eE][+-]?\d+)?"
 _NUMBER = re.compile(
     rf"[+-]?(?:\d{{1,3}}(?:[.,{_SPACES}]\d{{3}})+|\d+)?(?:[.,]\d*)?{_EXPONENT}|nan|[+-]?inf(?:inity)?", re.IGNORECASE
 )
-_WHEN = re.compile(
-    r"(?:[^\W\d_]{2,10}\.?,? )?(?:\d{1,4}([-./])(?:\d{1,2}|[^\W\d_]{3,10})\1\d{1,4}|\d{1,2}:\d\d"
-    r"|\d{1,2}\.? (?:[^\W\d_]{3,10}\.?),? \d|(?:[^\W\d_]{3,10}\.?) \d{1,2},? \d).*"
-)
-"""25.10.2020, 2020-10-25, 13:05, 25 Oct 2020, Oct 25, 2020, each with anything after it."""
 
 
 @lru_cache(4096)
@@ -327,8 +323,7 @@ def _is_typed(cell: str) -> bool:
     """Return whether a cell is a number, a date or a clock."""
     if _NUMBER.fullmatch(cell):
         return any(map(str.isalnum, cell))
-    text = re.sub(r"(:\d\d),(?=\d)|, ", r"\1.", cell)
-    return not set(text) & set(",;|\t") and _WHEN.fullmatch(cell) is not None
+    return CLOCK.fullmatch(cell) is not None or layout(cell) is not None or ns_of_iso(cell) is not None
 
 
 def _is_neutral(cell: str) -> bool:

@@ -15,8 +15,8 @@ import numpy as np
 
 from estimators.errors import SourceError, quoted
 
+from ..dates import CLOCK, is_day, layout, ns_of_date, ns_of_iso, since_epoch
 from ..units import to_ns
-from .dates import CLOCK, is_day, layout, ns_of_date, ns_of_iso, since_epoch
 
 if TYPE_CHECKING:
     import pyarrow
