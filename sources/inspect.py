@@ -29,7 +29,7 @@ from .tables.dialect import DETECTED, QUALITY_WORD, TIME_NAME, TIME_NAMES, Diale
 from .tables.order import Order, time_order
 from .tables.rows import TableRows, cells_of, format_of, names_of, remarks_of, rows_of
 from .tables.text import NO_VALUE, UNREADABLE, TextMatch
-from .tables.times import EPOCH_S, SKIPPED, TWICE, TimeColumn, TimeReader
+from .tables.times import EPOCH_S, SERIAL_DAYS, SKIPPED, TWICE, TimeColumn, TimeReader
 from .units import heading_unit, suffix_unit
 
 MAX_FRAME_BYTES = 64  # Bytes of the longest frame, of CAN FD
@@ -75,7 +75,7 @@ MAX_LEVELS = 8  # Different values up to which a column describes the source, an
 
 HORIZON_NS = 2_000_000_000  # By which a row may be late in a twin, unless its YAML gives another time.max_delay
 
-SERIAL_DATES = (36_526, 73_051)  # Days of the years 2000 to 2100 in Excel's count
+SERIAL_DAYS_SINCE_1970 = (10_957, 47_482)  # Of the years 2000 to 2100
 
 
 @dataclass(frozen=True)
@@ -406,9 +406,10 @@ def _tables(files: list[Path], time: TimeColumn, dialect: Dialect) -> RecordingC
         one = _series(name, heading_unit(name) or suffix_unit(name), t, column)
         split = name != by and labels and np.unique(one.values).size > MAX_LEVELS
         found += _split(one, by, labels, t, column, source) if split else [one]
-    low, high = (end * 10**9 for end in SERIAL_DATES)
-    if time.unit == "s" and low <= t[0] and t[-1] <= high and t[-1] - t[0] < 0.5e9 * t.size:
-        faults.append(f"column {chosen} looks like Excel's serial dates: add --time-unit excel")
+    for unit, origin in SERIAL_DAYS.items() if time.unit == "s" and t[-1] - t[0] < 0.5e9 * t.size else ():
+        low, high = ((origin + days) * 10**9 for days in SERIAL_DAYS_SINCE_1970)
+        if low <= t[0] and t[-1] <= high:
+            faults.append(f"column {chosen} looks like serial dates of {unit}: add --time-unit {unit}")
     return RecordingContents(
         files, "table", t, columns=found, time=time, faults=faults, texts=texts, by=by, dialect=dialect
     )

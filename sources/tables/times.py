@@ -33,7 +33,10 @@ MAX_TIME_NS = 2**62
 """Distance (146 years) of a time from 0; numbers beyond it are of another unit, or no times."""
 
 EPOCH_S = (631_152_000, 2_840_140_800)  # 1990 and 2060
+LABVIEW_S = 2_082_844_800  # From 1904-01-01, where LabVIEW counts from, to 1970
 _COMPACT = re.compile(r"(?:19|20)\d{10}(?:\d\d(?:\d{3})?)?")  # 20240315080000, with or without seconds and milliseconds
+_WHOLE_DAY = re.compile(r"(?:19|20)\d\d(?:0[1-9]|1[0-2])(?:0[1-9]|[12]\d|3[01])")  # 20240315
+_WHOLE_CLOCK = re.compile(r"(?:[01]\d|2[0-3])[0-5]\d[0-5]\d(?:\.\d*)?")  # 080010
 
 _NAMED_DAY = re.compile(r"(?<!\d)((?:19|20)\d\d)([-_.]?)(0[1-9]|1[0-2])\2(0[1-9]|[12]\d|3[01])(?!\d)")
 """A date in the name of a file."""
@@ -79,8 +82,8 @@ class TimeReader:
 
     A clock without a date begins at the column's `date`, or that in the name of the file `path`, and passes midnight
     when it goes back by more than an hour. Without a file, it is no time. Numbers that are too large for seconds are of
-    the unit in which the first one is a time between 1990 and 2060. `notes` are rows of the last chunk whose time was
-    assumed: row, key, text.
+    the unit in which the first one is a time between 1990 and 2060; those that all spell a date (20240315) or a clock
+    (080010) are read so. `notes` are rows of the last chunk whose time was assumed: row, key, text.
 
     Raises:
         SourceError: If dates may be day/month as well as month/day, or the zone is unknown.
@@ -97,8 +100,9 @@ class TimeReader:
         self._undated, self._clock = date is None, 0
         self._day: str | None = ""  # the last cell; None once a date without a clock has been noted
         days = SERIAL_DAYS.get(column.unit)
-        self._factor = UNITS[column.unit] if days is None else DAY_NS
+        self._factor, self._days = (UNITS[column.unit], False) if days is None else (DAY_NS, True)
         self._seconds = column.unit == "s"  # until the first number shows that they are
+        self._spelt: str | None = None if self._seconds and column.format is None else ""  # what numbers spell
         self._origin = days or 0
         self._order: str | None = None
         self._summer = _SummerTime(column, self.notes) if column.zone is not None else None
@@ -121,6 +125,10 @@ class TimeReader:
             t = whole.fill_null(0).to_numpy(zero_copy_only=False)
             return self._local(t, known & (zone is None)), known
         numeric = pyarrow.types.is_floating(kind) or pyarrow.types.is_integer(kind)
+        if numeric and self._spelt != "":
+            texts = ["" if item is None else f"{item:.15g}" for item in cells.to_pylist()]
+            if self._spelt or self._spells(texts):
+                return self._of_cells(texts)
         if self._seconds and numeric and known.any():
             self._fit_unit(float(cells.drop_null()[0].as_py()))
         if pyarrow.types.is_integer(kind) and not self._origin:
@@ -131,7 +139,7 @@ class TimeReader:
             numbers = cells.cast(pyarrow.float64()).to_numpy(zero_copy_only=False) - self._origin
             known = known & (np.abs(numbers) <= MAX_TIME_NS / self._factor)
             t = to_ns(np.where(known, numbers, 0.0) * (self._factor / 1e9))
-            return (self._local(t, known) if self._origin else t), known
+            return (self._local(t, known) if self._days else t), known
         return self._of_cells([item or "" for item in cells.cast(pyarrow.string()).to_pylist()])
 
     def is_date(self, cell: str) -> bool:
@@ -141,6 +149,8 @@ class TimeReader:
     def _of_cells(self, cells: list[str]) -> tuple[np.ndarray, np.ndarray]:
         if self._order is None and self._column.format is None:
             self._order = _day_and_month(self._column.label, cells)
+        if self._spelt is None:
+            self._spells(cells)
         t = np.zeros(len(cells), np.int64)
         known, naive = np.zeros((2, len(cells)), np.bool_)
         for k, cell in enumerate(cells):
@@ -174,15 +184,44 @@ class TimeReader:
             return ns_of_iso(text) or ns_of_date(text, self._order == "month")
         if not np.isfinite(number):
             return None
+        if self._spelt == "clock":
+            clock = ns_of_date(f"1970/01/01 {_padded(text)}", False)
+            return clock and self._of_clock(clock[0])
+        if self._spelt == "day":
+            return ns_of_date(text, False)
         if self._seconds and _COMPACT.fullmatch(text):
             return ns_of_date(f"{text[:8]} {text[8:12]}{text[12:14] or '00'}.{text[14:] or '0'}", False)
         if self._seconds:
             self._fit_unit(number)
-        return int(((Decimal(text) - self._origin) * self._factor).to_integral_value()), self._origin > 0
+        return int(((Decimal(text) - self._origin) * self._factor).to_integral_value()), self._days
+
+    def _spells(self, cells: list[str]) -> str:
+        """Return and keep what the numbers of the first rows spell: "day", "clock", or nothing.
+
+        A clock goes from 59 to 100, or from 5959 to 10000, in a usual step of seconds, but no usual one of numbers.
+        """
+        cells, self._spelt = [cell for cell in cells if cell], ""
+        if cells and all(_WHOLE_DAY.fullmatch(cell) and ns_of_date(cell, False) for cell in cells):
+            self._spelt = "day"
+            self.notes.append((0, ASSUMED, f"{self._column.label} is {cells[0]}, taken as a date"))
+        elif cells and self._midnight is not None and all(_WHOLE_CLOCK.fullmatch(_padded(cell)) for cell in cells):
+            numbers = np.array(cells, float)
+            seconds = numbers - 40.0 * (numbers // 100) - 2400.0 * (numbers // 10_000)
+            steps, clocks = np.diff(numbers), np.diff(seconds)
+            least = np.min(steps, where=steps > 0.0, initial=np.inf)
+            most = 2.0 * np.median(clocks) if clocks.size else 0.0
+            passed = (steps - clocks > 39.0) & (steps > 1.5 * least) & (clocks <= most)
+            if passed.any() or any(len(cell.partition(".")[0]) == 6 and cell[0] == "0" for cell in cells):
+                self._spelt = "clock"
+        return self._spelt
 
     def _fit_unit(self, number: float) -> None:
         """Take the unit of the times from the first of them, if that is too large for seconds."""
         self._seconds = False
+        if EPOCH_S[1] < number <= EPOCH_S[1] + LABVIEW_S:
+            self._origin, when = LABVIEW_S, datetime.fromtimestamp(number - LABVIEW_S, UTC)
+            text = f"{self._column.label} is {number:.0f}, taken as seconds since 1904, as of LabVIEW ({when:%Y-%m-%d})"
+            self.notes.append((0, ASSUMED, text))
         for unit in ("ms", "us", "ns"):
             t = number * UNITS[unit] / 1e9
             if abs(number) * 1e9 > MAX_TIME_NS and EPOCH_S[0] <= t <= EPOCH_S[1]:
@@ -210,6 +249,12 @@ class TimeReader:
         rows = np.flatnonzero(local)
         t[rows] = self._summer.to_utc(t[rows], rows)
         return t
+
+
+def _padded(cell: str) -> str:
+    """Return a number as hours, minutes and seconds of two digits each: 080010.5 of 80010.5."""
+    whole, dot, fraction = cell.partition(".")
+    return whole.zfill(6) + (dot + fraction if fraction.strip("0") else "")
 
 
 class _SummerTime:

@@ -9,6 +9,7 @@ from pathlib import Path
 import pyarrow as pa
 import pytest
 
+from sources.inspect import inspect_recordings
 from sources.tables.times import ASSUMED, TimeColumn, TimeReader
 
 SPELLINGS = (Path(__file__).parent / "spellings.csv").read_text("utf-8").splitlines()[1:]
@@ -97,6 +98,85 @@ def test_the_unit_of_times_since_1970_is_told(unit, factor):
 
 def test_seconds_that_grow_stay_seconds():
     assert read("1.5", "1710489600000") == [1_500_000_000, None]
+
+
+CLOCK = [f"{k // 3600:02}{k // 60 % 60:02}{k % 60:02}" for k in range(36_000 - 90, 36_000 + 90)]
+"""Clocks from 09:58:30 on, one a second: 095830 to 100129."""
+
+
+def times_of(cells, name="log.csv"):
+    """Return the times (s) of cells, and the notes without their remedy."""
+    times = TimeReader(TimeColumn("t"), Path(name))
+    t, known = times.read(cells)
+    assert known.all()
+    return [each / 1e9 for each in t.tolist()], [text for _, _, text in times.notes]
+
+
+@pytest.mark.parametrize(
+    ("cells", "first"),
+    [
+        (CLOCK, 35_910),
+        (CLOCK[90:], 36_000),  # no leading zero
+        ([f"{cell}.25" for cell in CLOCK], 35_910.25),
+        (pa.array(list(map(int, CLOCK))), 35_910),
+        (pa.array([int(cell) + 0.25 for cell in CLOCK]), 35_910.25),
+    ],
+)
+def test_numbers_that_spell_a_clock_are_one(cells, first):
+    t, notes = times_of(cells, "log_2024-03-15.csv")
+    day = MOMENT_NS / 1e9 - 8 * 3600
+    assert t == pytest.approx([day + first + k for k in range(len(cells))], abs=1e-6) and not notes
+    t, notes = times_of(cells)
+    assert t[0] == first and notes == ["t is a clock without a date, counted from 1970-01-01; give it in time.date"]
+
+
+def test_clocks_once_a_minute_pass_the_hour():
+    cells = [f"{k // 60:02}{k % 60:02}00" for k in range(600 - 5, 600 + 70)]
+    assert times_of(cells[5:])[0] == [60.0 * k for k in range(600, 670)]
+
+
+@pytest.mark.parametrize(
+    "numbers",
+    [
+        range(36_000 - 90, 36_000 + 90),  # seconds of the day
+        range(100_000, 100_060),  # within a minute it may be either, at the same intervals
+        range(10_000, 16_000, 100),  # each of which could be a clock
+        [5, 6, 7, 130, 131, 132, 210, 211],  # bursts
+        [20_240_229, 20_240_230],  # no such day
+        [0.0, 0.5, 1.0],
+    ],
+)
+def test_numbers_that_count_are_seconds(numbers):
+    for cells in ([str(each) for each in numbers], pa.array(list(numbers))):
+        assert times_of(cells) == ([float(each) for each in numbers], [])
+
+
+def test_whole_numbers_that_are_all_days_are_dates():
+    days = ["20240229", "20240301", "20240302"]
+    first = 1_709_164_800.0  # 2024-02-29T00:00:00Z by `date -u +%s`
+    for cells in (days, pa.array(list(map(int, days)))):
+        t, notes = times_of(cells)
+        assert t == [first, first + 86_400, first + 2 * 86_400] and notes == ["t is 20240229, taken as a date"]
+
+
+def test_seconds_of_labview_count_from_1904():
+    """3,793,334,400 = 1,710,489,600 + 66 years of 365 days and 17 leap days."""
+    number = 1_710_489_600 + (66 * 365 + 17) * 86_400
+    for cells in ([str(number), str(number + 1)], pa.array([number, number + 1])):
+        t, (note,) = times_of(cells)
+        assert t == [MOMENT_NS / 1e9, MOMENT_NS / 1e9 + 1]
+        assert note == f"t is {number}, taken as seconds since 1904, as of LabVIEW (2024-03-15)"
+
+
+@pytest.mark.parametrize(("unit", "day"), [("excel", 45_366), ("matlab", 739_326)])
+def test_serial_dates_that_are_read_as_seconds_are_named(tmp_path, unit, day):
+    """Both are 2024-03-15, by a spreadsheet and by MATLAB's manual."""
+    path = tmp_path / "log.csv"
+    path.write_text("t,level\n" + "".join(f"{day + (28_800 + k) / 86_400:.8f},{k % 7}\n" for k in range(50)))
+    line = f"column t looks like serial dates of {unit}: add --time-unit {unit}"
+    assert inspect_recordings([path]).faults == [line]
+    found = inspect_recordings([path], time=TimeColumn("t", unit))
+    assert found.faults == [] and found.t[0] == pytest.approx(MOMENT_NS, abs=10**6)
 
 
 def test_the_months_of_a_two_digit_year_are_told_by_its_formats():
