@@ -120,12 +120,16 @@ def fitted(
         ]
         return max((one for one in tried if one is not None), key=lambda one: one.value, default=None)
 
-    white = best([Structure(smooth, over) for smooth in models for over in (False, True)])
+    def better(one: FittedStructure, structures: Iterable[Structure]) -> FittedStructure:
+        return max(one, best(structures) or one, key=lambda each: each.value)
+
+    white = best(Structure(smooth) for smooth in models)
     if white is None:
         return []
-    chosen = white
+    # A coloured acceleration is tried only where a white one is better than a white speed.
+    chosen = white = better(white, [Structure(smooth, True) for smooth in models if smooth <= white.structure.smooth])
     if len(item.sensors) > 1:
-        chosen = max(white, best([white.structure._replace(errors=True)]) or white, key=lambda one: one.value)
+        chosen = better(white, [white.structure._replace(errors=True)])
     return [chosen, *(best([chosen.structure], options) for options in OPTIONS[1:])]
 
 
