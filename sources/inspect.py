@@ -61,8 +61,8 @@ OPC_GOOD = 192
 MAX_TEXTS = 50  # Different texts of a column that are counted
 
 TAG = re.compile(
-    r"(^|[\W_])(id|ids|tag|tags|node|anchor|beacon|channel|sensor|point|signal|variable|item|metric|name|messstelle|"
-    r"kanal)$|[a-z](Id|ID|Tag|Name)$|(tag|sensor|point)_?name$",
+    r"(^|[\W_])(id|ids|tag|tags|node|anchor|beacon|channel|sensor|point|signal|variable|item|metric|name|field|series|"
+    r"messstelle|kanal)$|[a-z](Id|ID|Tag|Name)$|(tag|sensor|point)_?name$",
     re.IGNORECASE,
 )
 """Names of columns that name the source of a row."""
@@ -510,24 +510,32 @@ def _rows(
 
 
 def _time_of(path: Path, names: Sequence[str], time: TimeColumn, dialect: Dialect) -> str | None:
-    """Return the time column, by its name, as the first one of dates, or as the first that counts from 1970."""
+    """Return the time column, by its name, as the first one of dates, or as the first that counts from 1970.
+
+    Dates that stay the same, such as the begin and end of a query, are taken only if there are no others.
+    """
     able = [name for name in names if (heading_unit(name) or "s").lower() in TIME_UNITS]  # T [°C] is none.
     last = {_bare(name): name for name in reversed(able)}
     named = next((last[name] for name in TIME_NAMES if name in last), None)
     like = next((name for name in able if TIME_NAME.search(name)), None)
     if named is not None or (cells := cells_of(path, dialect)) is None:
         return named or like
-    row = next(cells, [])
-    for pattern in (None, CLOCK):
-        for name, cell in zip(names, map(str.strip, row), strict=False):
-            if cell.replace(",", "").replace(".", "").lstrip("+-").isdigit():
-                continue
-            if pattern.fullmatch(cell) if pattern else TimeReader(time._replace(name=name)).is_date(cell):
-                return name
-    if like is not None:
-        return like
-    rows = [one for one in (row, *islice(cells, MAX_TEXTS)) if len(one) == len(names)]
-    return next((name for k, name in enumerate(names) if _since_1970([cell[k] for cell in rows])), None)
+    rows = [[cell.strip() for cell in row] for row in islice(cells, MAX_TEXTS) if len(row) >= len(names)]
+    columns = dict(zip(names, zip(*rows, strict=False), strict=False))
+    texts = {
+        name: column
+        for name, column in columns.items()
+        if not column[0].replace(",", "").replace(".", "").lstrip("+-").isdigit()
+    }
+    moving = {name: column for name, column in texts.items() if len({*column}) > 1 or len(rows) == 1}
+    for among in (moving, texts):
+        for pattern in (None, CLOCK):
+            for name, column in among.items():
+                if pattern.fullmatch(column[0]) if pattern else TimeReader(time._replace(name=name)).is_date(column[0]):
+                    return name
+        if like is not None:
+            return like
+    return next((name for name, column in columns.items() if _since_1970(column)), None)
 
 
 def _bare(name: str) -> str:
@@ -537,7 +545,7 @@ def _bare(name: str) -> str:
     return base if base and unit in TIME_UNITS else text
 
 
-def _since_1970(cells: list[str]) -> bool:
+def _since_1970(cells: Sequence[str]) -> bool:
     """Return whether numbers rise and are times since 1970, in any unit."""
     try:
         numbers = np.array(cells, np.float64)

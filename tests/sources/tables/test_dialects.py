@@ -185,3 +185,38 @@ def test_rows_with_more_cells_are_left_out_unless_these_are_blank(tmp_path):
     events = read(path, TimeColumn("time"), ["TT101"], report=reports)
     assert (events.t // 10**9).tolist() == [0, 2, 3]
     assert reports.texts["unreadable value"] == "drive.csv:3: has 4 cells, not 3; the row is left out"
+
+
+def test_the_times_and_the_series_of_an_annotated_csv_are_those_of_its_rows(tmp_path):
+    """Annotated CSV of InfluxDB: _start and _stop are those of the query, _field names the series."""
+    head = (
+        "#group,false,false,true,true,false,false,true,true\n"
+        "#datatype,string,long,dateTime:RFC3339,dateTime:RFC3339,dateTime:RFC3339,double,string,string\n"
+        "#default,_result,,,,,,,\n,result,table,_start,_stop,_time,_value,_field,_measurement\n"
+    )
+    query = "2024-03-15T08:00:00Z,2024-03-15T09:00:00Z"
+    rows = (
+        f",,{table},{query},2024-03-15T08:00:{second:02d}Z,{10 * table + second / 8},{field},tank\n"
+        for table, field in enumerate(("temp", "level"))
+        for second in range(30)
+    )
+    found = inspect_recordings([write(tmp_path, head + "".join(rows))])
+    assert found.time.name == "_time" and found.by == "_field"
+    assert np.unique(found.t).tolist() == [(1_710_489_600 + second) * 10**9 for second in range(30)]
+    series = {one.name: one.values.tolist() for one in found.columns if one.only}
+    assert series["_value_temp"] == [k / 8 for k in range(30)]
+    assert series["_value_level"] == [10 + k / 8 for k in range(30)]
+
+
+@pytest.mark.parametrize(
+    ("text", "time"),
+    [
+        ("from,Uhr\n2024-03-15,08:00:00\n2024-03-15,08:00:01\n", "from"),  # a date and a clock are both taken
+        ("from,at,x\n2024-03-15 08:00,2024-03-15 08:01,1\n2024-03-15 08:00,2024-03-15 08:02,2\n", "at"),
+        ("from,x,my time\n2024-03-15 08:00,1,0.5\n2024-03-15 08:00,2,1.5\n", "my time"),
+        ("from,x\n2024-03-15 08:00,1\n2024-03-15 08:00,2\n", "from"),
+        ("from,x,my time\n2024-03-15 08:00,1,0.5\n", "from"),
+    ],
+)
+def test_a_date_that_stays_the_same_is_a_time_only_if_there_is_no_other(tmp_path, text, time):
+    assert inspect_recordings([write(tmp_path, text)]).time.name == time
