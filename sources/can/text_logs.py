@@ -116,7 +116,8 @@ def _plain(line: str) -> str:
 
 def _stamp(zone: str | None, at: datetime) -> float:
     """Return the seconds since 1970 of a local time; a zone that is None is UTC."""
-    return at.replace(tzinfo=ZoneInfo(zone) if zone else UTC).timestamp()
+    known = datetime.strptime(zone, "%z").tzinfo if zone and zone[0] in "+-" else zone and ZoneInfo(zone)
+    return at.replace(tzinfo=known or UTC).timestamp()
 
 
 class TextLog(TextIOMessageReader):
