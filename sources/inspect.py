@@ -365,7 +365,7 @@ def _tables(files: list[Path], time: TimeColumn, dialect: Dialect) -> RecordingC
             f"{len(other)} columns have another number of rows than {chosen} and are left out: {shown}; name their "
             "own time column to read them"
         )
-    times, values = [], []
+    times, values, zoneless = [], [], False
     counted: dict[str, list[str]] = {UNDATED: [], TWICE: [], SKIPPED: []}
     order = Order(time.label, time.unit, HORIZON_NS, lambda key, text: None if text in faults else faults.append(text))
     form = format_of(files[0])
@@ -373,7 +373,7 @@ def _tables(files: list[Path], time: TimeColumn, dialect: Dialect) -> RecordingC
         return _sparse(files, time, columns, order, faults)
     for path in files:
         for rows in _rows(path, time, columns, faults, counted, dialect):
-            time = time._replace(unit=rows.unit)
+            time, zoneless = time._replace(unit=rows.unit), zoneless or rows.zoneless
             times.append(rows.t[rows.known])
             values.append(rows.values[rows.known])
             order.check(path.name, rows.line[rows.known], times[-1])
@@ -389,6 +389,9 @@ def _tables(files: list[Path], time: TimeColumn, dialect: Dialect) -> RecordingC
         more = f"; so are {len(undated) - 1} more rows" if len(undated) > 1 else ""
         faults.append(undated[0] + more)
     t, v = np.concatenate(times), np.concatenate(values)
+    if zoneless and t[-1] > DATED_S * 1e9:
+        where = f"{files[0].name}: its dates"
+        faults.append(f"{where} have no time zone and are taken to be UTC; give one with --time-zone")
     wordy = [name for name, column in zip(columns, v.T, strict=True) if not np.isfinite(column).any()]
     texts = _texts(files, wordy, dialect)
     words = {key: key.removeprefix(NO_VALUE).partition(": ")[0] for key, rows in counted.items() if rows}
