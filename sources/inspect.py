@@ -30,7 +30,7 @@ from .tables.order import Order, time_order
 from .tables.rows import TableRows, cells_of, format_of, names_of, remarks_of, rows_of
 from .tables.text import NO_VALUE, UNREADABLE, TextMatch
 from .tables.times import EPOCH_S, SKIPPED, TWICE, TimeColumn, TimeReader
-from .units import heading_unit, suffix_unit
+from .units import heading_unit, suffix_unit, unknown_unit
 
 MAX_FRAME_BYTES = 64  # Bytes of the longest frame, of CAN FD
 
@@ -365,6 +365,9 @@ def _tables(files: list[Path], time: TimeColumn, dialect: Dialect) -> RecordingC
             f"{len(other)} columns have another number of rows than {chosen} and are left out: {shown}; name their "
             "own time column to read them"
         )
+    if strange := [name for name in columns if unknown_unit(name)]:
+        more = f" and of {len(strange) - 1} more" if len(strange) > 1 else ""
+        faults.append(f"the unit of {strange[0]}{more} is not known; give it under `units`")
     times, values, zoneless = [], [], False
     counted: dict[str, list[str]] = {UNDATED: [], TWICE: [], SKIPPED: []}
     order = Order(time.label, time.unit, HORIZON_NS, lambda key, text: None if text in faults else faults.append(text))

@@ -288,7 +288,10 @@ class _Table:
                 names = [_with_unit(name, cells[k]) if k in of_numbers else name for k, name in enumerate(names)]
             if given.heading is None and (heading.line > given.skip + 1 or units):
                 remarks.append(f"heading in line {heading.line}")
-            remarks += [f"units in line {row.line}" for row in units]
+            for row in units:
+                strange = [cell for cell in row.cells if cell.strip("[]() ") not in NO_UNITS and not _unit_in(cell)]
+                unknown = f" (not known: {', '.join(strange)}; give them under `units`)" if strange else ""
+                remarks.append(f"units in line {row.line}{unknown}")
         else:
             width = self._width - self._ragged
             names, first = [f"c{k}" for k in range(1, width + 1)], rows[0].line
@@ -348,9 +351,12 @@ def _timed(row: _Row) -> int:
     return 2 if set(names) & set(TIME_NAMES) else int(any(map(TIME_NAME.search, names)))
 
 
+NO_UNITS = ("-", "", "1", "unitless", "TS", "RN")  # TS and RN are those of time and number of a Campbell logger
+
+
 def _unit_in(cell: str) -> str:
     """Return the unit that a cell of a row of units gives; empty if it gives none."""
-    return heading_unit(f"x [{cell.strip('[]() ')}]") or ""
+    return "" if (text := cell.strip("[]() ")) in NO_UNITS else heading_unit(f"x [{text}]") or ""
 
 
 def _unit_rows(block: Sequence[_Row]) -> list[_Row]:
@@ -358,8 +364,9 @@ def _unit_rows(block: Sequence[_Row]) -> list[_Row]:
     found = []
     for row in block[1:]:
         cells = [cell for cell in row.cells if cell]
-        share = sum(cell.strip("[]() ") in ("-", "", "1") or bool(_unit_in(cell)) for cell in cells) / len(cells)
-        if any(map(_unit_in, cells)) and (share == 1.0 or (share >= 0.5 and _timed(row) < 2)):
+        share = sum(cell.strip("[]() ") in NO_UNITS or bool(_unit_in(cell)) for cell in cells) / len(cells)
+        timed = _timed(row) == 2 > max(_timed(one) for one in block if one.line < row.line)  # a row of names
+        if any(map(_unit_in, cells)) and (share == 1.0 or (share >= 0.5 and not timed)):
             found.append(row)
     return found
 

@@ -220,3 +220,32 @@ def test_the_times_and_the_series_of_an_annotated_csv_are_those_of_its_rows(tmp_
 )
 def test_a_date_that_stays_the_same_is_a_time_only_if_there_is_no_other(tmp_path, text, time):
     assert inspect_recordings([write(tmp_path, text)]).time.name == time
+
+
+def test_the_units_of_a_campbell_logger_are_those_of_its_second_row(tmp_path):
+    """TOA5: line of the logger, names, units (TS and RN of time and record), and how each was processed."""
+    head = (
+        '"TOA5","CR1000","CR1000","1011","CR1000.Std.22","CPU:a.CR1","19246","Table1"\n'
+        '"TIMESTAMP","RECORD","BattV_Avg","AirTC_Avg","WS","Turb"\n'
+        '"TS","RN","Volts","Deg C","meters/second","NTU"\n"","","Avg","Avg","Smp","Smp"\n'
+    )
+    rows = "".join(f'"2024-03-15 08:{k:02}:00",{k},12.5,2{k % 10}.5,{k % 7},{k % 5}.1\n' for k in range(40))
+    found = inspect_recordings([write(tmp_path, head + rows)])
+    units = {one.name: one.unit for one in found.columns}
+    assert units == {
+        "RECORD": "",
+        "BattV_Avg [Volts]": "Volts",
+        "AirTC_Avg [Deg C]": "Deg C",
+        "WS [meters/second]": "meters/second",
+        "Turb": "",
+    }
+    assert found.faults[0] == (
+        "drive.csv: heading in line 2, units in line 3 (not known: NTU; give them under `units`)"
+    )
+
+
+def test_the_unit_of_a_heading_that_is_not_known_is_said(tmp_path):
+    rows = "".join(f"{k},{k},{k},{k}\n" for k in range(9))
+    found = inspect_recordings([write(tmp_path, "t,A [NTU],B (cfu),C [bar]\n" + rows)])
+    assert found.faults[0] == "the unit of A [NTU] and of 1 more is not known; give it under `units`"
+    assert [one.unit for one in found.columns] == ["", "", "bar"]
