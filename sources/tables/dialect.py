@@ -152,6 +152,9 @@ def format_of(path: Path, head: bytes, given: Dialect = DETECTED) -> CsvFormat:
         lines.pop()  # It is cut.
     if separator := re.fullmatch(r'"?sep=(.)"?\s*', lines[0] if lines else "", re.IGNORECASE):
         given = given._replace(delimiter=given.delimiter or separator[1], skip=max(given.skip, 1))
+    begin, types, rows = (next((k for k, one in enumerate(lines) if mark.match(one)), -1) for mark in _IGNITION)
+    if 0 <= begin < types < rows:
+        lines[begin], lines[types : rows + 1] = "\n", "\n" * (rows + 1 - types)
     if given.heading and not "".join(lines[given.heading - 1 : given.heading]).strip(f"\r\n{DELIMITERS}"):
         raise SourceError(f"{path}: its heading is to be line {given.heading}, which is blank or not there; correct it")
     first = lines[given.skip] if given.skip < len(lines) else ""
@@ -162,7 +165,12 @@ def format_of(path: Path, head: bytes, given: Dialect = DETECTED) -> CsvFormat:
         line, delimiter = given.heading or given.skip + 1, tables[0].delimiter
         names = [name.strip() for name in next(_reader(lines[line - 1 : line], delimiter), [])]
         return CsvFormat(names, delimiter, given.decimal or ".", encoding, line + 1)
-    return best.format(path, encoding)
+    found = best.format(path, encoding)
+    return found._replace(first=max(found.first, rows + 2 if begin >= 0 else 0))
+
+
+_IGNITION = [re.compile(rf'"?#{word}\b') for word in ("NAMES", "TYPES", "ROWS")]
+"""Lines before the names, the types and the rows in an export of Ignition; only the names are of the heading."""
 
 
 def _encoding(head: bytes) -> str:

@@ -112,6 +112,18 @@ SAMPLES = {
         "heading in line 2, units in line 3",
         {"skiprows": 4, "names": NAMES},
     ),
+    "ignition": Sample(
+        '"#NAMES"\n"time","TT101","FT201"\n"#TYPES"\n"D","F","F"\n"#ROWS","40"\n' + body(quote='"'),
+        NAMES,
+        "heading in line 2",
+        {"skiprows": 5, "names": NAMES},
+    ),
+    "ignition_bare": Sample(
+        "#NAMES\n" + HEAD + "#TYPES\nD,F,F\n#ROWS,40\n" + body(),
+        NAMES,
+        "heading in line 2",
+        {"skiprows": 5, "names": NAMES},
+    ),
     "no_heading": Sample(body(), ("c1", "c2", "c3"), "no heading, so columns are named c1 to c3", {"header": None}),
     "trailing": Sample(HEAD + body(after=","), NAMES, "", {"index_col": False}),
     "trailing_all": Sample(HEAD[:-1] + ",\n" + body(after=","), NAMES, "", {"usecols": NAMES}),
