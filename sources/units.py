@@ -15,33 +15,11 @@ if TYPE_CHECKING:
     import pint
 
 _SAME = {
-    "%": "percent",
-    "kmh": "km/h",
-    "kph": "km/h",
-    "km/hr": "km/h",
-    "Nm": "N*m",
-    "1/min": "rpm",
-    "U/min": "rpm",
-    "r/min": "rpm",
-    "rev/min": "rpm",
-    "min-1": "rpm",
-    "1/s": "Hz",
-    "m/s/s": "m/s**2",
-    "G": "standard_gravity",
-    "sec": "s",
-    "Amps": "A",
-    "Ohm": "ohm",
-    "degrees": "deg",
-    "PS": "metric_horsepower",
-    "As": "A*s",
-    "rev": "turn",
-    "kmph": "km/h",
-    "centigrade": "degC",
-    "ft-lb": "ft*lbf",
-    "lb-ft": "ft*lbf",
-    "inWC": "inH2O",
-    "psia": "psi",
-}
+    "%": "percent", "kmh": "km/h", "kph": "km/h", "km/hr": "km/h", "Nm": "N*m", "1/min": "rpm", "U/min": "rpm",
+    "r/min": "rpm", "rev/min": "rpm", "min-1": "rpm", "1/s": "Hz", "m/s/s": "m/s**2", "G": "standard_gravity",
+    "sec": "s", "Amps": "A", "Ohm": "ohm", "degrees": "deg", "PS": "metric_horsepower", "As": "A*s", "rev": "turn",
+    "kmph": "km/h", "centigrade": "degC", "ft-lb": "ft*lbf", "lb-ft": "ft*lbf", "inWC": "inH2O", "psia": "psi",
+}  # fmt: skip
 """Spellings with one meaning (1/min on a bus is a rotation)."""
 
 _ANY_CASE = {
@@ -85,16 +63,9 @@ def _normal(unit: str) -> str:
     text = unit.strip()
     text = re.sub(r"\b[dD]eg(?:ree)?s? ?([CF])\b", r"deg\1", _SAME.get(text, text))
     for old, new in (
-        ("Ohm", "ohm"),
-        ("℃", "degC"),
-        ("°C", "degC"),
-        ("°F", "degF"),
-        ("°", "deg"),
-        ("·", "*"),
-        ("²", "**2"),
-        ("³", "**3"),
-        ("^", "**"),
-    ):
+        ("Ohm", "ohm"), ("℃", "degC"), ("°C", "degC"), ("°F", "degF"), ("°", "deg"), ("·", "*"), ("²", "**2"),
+        ("³", "**3"), ("^", "**"),
+    ):  # fmt: skip
         text = text.replace(old, new)
     text = re.sub(r"\b([kmMc]?)N(c?m)\b", r"(\1N*\2)", text)
     return re.sub(r"(?<=[A-Za-z])(?=\d)", "**", text) if "/" in text or text[-1:].isdigit() else text

@@ -34,7 +34,7 @@ QUALITY_WORD = re.compile(
 
 TIME_NAMES = (
     "time", "timestamp", "t", "ts", "seconds", "time_s", "t_s", "date", "datetime", "unix_time", "elapsed", "zeit",
-    "zeitstempel", "datum", "horodatage", "fecha",
+    "zeitstempel", "datum", "horodatage", "fecha", "x_value",
 )  # fmt: skip
 """Usual names of a time column, the surest first; else the first of dates, or the first that is named like one."""
 
@@ -155,6 +155,9 @@ def format_of(path: Path, head: bytes, given: Dialect = DETECTED) -> CsvFormat:
     begin, types, rows = (next((k for k, one in enumerate(lines) if mark.match(one)), -1) for mark in _IGNITION)
     if 0 <= begin < types < rows:
         lines[begin], lines[types : rows + 1] = "\n", "\n" * (rows + 1 - types)
+    if ends := [k for k, one in enumerate(lines, 1) if one.startswith("***End_of_Header***")][:2]:  # LabVIEW's .lvm
+        lines[: ends[-1]] = "\n" * ends[-1]
+        lines[ends[-1] :] = [re.sub(r"^(X_Value.*)\WComment\s*$", r"\1\n", one) for one in lines[ends[-1] :]]
     if given.heading and not "".join(lines[given.heading - 1 : given.heading]).strip(f"\r\n{DELIMITERS}"):
         raise SourceError(f"{path}: its heading is to be line {given.heading}, which is blank or not there; correct it")
     first = lines[given.skip] if given.skip < len(lines) else ""
