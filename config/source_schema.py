@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
+import re
 from datetime import date
 from typing import TYPE_CHECKING, Annotated, Literal, Union
-from zoneinfo import ZoneInfo, ZoneInfoNotFoundError, available_timezones
+from zoneinfo import available_timezones
 
 from pydantic import AfterValidator, BeforeValidator, Field, model_validator
 
@@ -81,7 +82,7 @@ class ProfileSection(Section):
         one_of(self, "constant", "steps", "sine", required=True)
         if self.steps is not None:
             times = [t for t, _ in self.steps]
-            if any(b <= a for a, b in zip(times, times[1:], strict=False)):
+            if times != sorted(set(times)):
                 raise refused("relation", "must have rising times; put them in order", "steps")
         if self.repeat is not None and (self.steps is None or self.repeat <= self.steps[-1][0]):
             raise refused("relation", f"is {self.repeat} s; it needs steps that all begin before it", "repeat")
@@ -198,11 +199,12 @@ class RecordingSection(Section):
     """Where to get the recording, shown when it is absent."""
 
 
-def _known_zone(name: str) -> str:
-    try:
-        ZoneInfo(name)
-    except (ZoneInfoNotFoundError, ValueError, OSError):
-        raise refused("value", f"is no time zone of this machine; {nearest(name, available_timezones())}") from None
+def known_zone(name: str) -> str:
+    """Return a time zone, UTC+1 as +01:00."""
+    if offset := re.fullmatch(r"(?:UTC|GMT)?([+-])(0?\d|1[0-4])(?::?([0-5]\d))?", name):
+        return f"{offset[1]}{offset[2]:0>2}:{offset[3] or '00'}"
+    if name not in (zones := available_timezones()):
+        raise refused("value", f"is no time zone of this machine; {nearest(name, zones)}")
     return name
 
 
@@ -211,8 +213,8 @@ class CanLogSection(SignalMaps, RecordingSection):
 
     type: Literal["can_log"]
     """can_log"""
-    zone: Annotated[str, AfterValidator(_known_zone)] | None = None
-    """Time zone of dates in text logs, which have none there: Europe/Berlin. Default: null, UTC."""
+    zone: Annotated[str, AfterValidator(known_zone)] | None = None
+    """Time zone of dates in text logs, which have none there: Europe/Berlin, +01:00. Default: null, UTC."""
 
 
 def _known_date(text: str) -> str:
@@ -235,11 +237,10 @@ class TimeColumnSection(Section):
     """Its unit, if it holds numbers; excel and matlab count days, as serial dates do there. Default: s."""
     format: Text | None = None
     """Format of its dates, as in Python's strptime: "%m/%d/%Y %H:%M:%S". Default: null, detected."""
-    zone: Annotated[str, AfterValidator(_known_zone)] | None = None
-    """Time zone of dates without an offset: Europe/Berlin. Default: null, UTC."""
+    zone: Annotated[str, AfterValidator(known_zone)] | None = None
+    """Time zone of dates without an offset: Europe/Berlin, +01:00. Default: null, that of the heading or UTC."""
     date: Annotated[str, AfterValidator(_known_date)] | None = None
-    """Date of the first row of each file, if the column holds clocks without one: 2024-03-04. Default: null, that in
-    the file's name, else 1970-01-01."""
+    """Date of a file's first row if the column holds clocks: 2024-03-04. Default: that in its name, or 1970-01-01."""
     shift: Time = 0.0
     """Seconds added to it: -0.2 if a row describes the 0.2 s before it, so that an input holds for these and not for
     the next. Default: 0."""
@@ -265,8 +266,7 @@ class TableSection(RecordingSection):
     """Whether the files are CSV that grow, or appear in the folders that `files` names, while the twin runs: each row
     is read once, files in the order of their names. Default: false."""
     heading: Annotated[int, Field(strict=True, ge=1)] | Literal["none"] | None = None
-    """Line of a CSV, or row of a sheet, with the names of the columns; none if there is none, and they are c1, c2, ...
-    Default: null, detected."""
+    """Line of a CSV, or row of a sheet, with the names of the columns; none: c1, c2, ... Default: null, detected."""
     delimiter: Text | None = None
     """Sign between the cells of a CSV; tab and space are words. Default: null, detected."""
     decimal: Literal[".", ","] | None = None

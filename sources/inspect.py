@@ -30,7 +30,7 @@ from .tables.order import Order, time_order
 from .tables.rows import TableRows, cells_of, format_of, names_of, remarks_of, rows_of
 from .tables.text import NO_VALUE, UNREADABLE, TextMatch
 from .tables.times import EPOCH_S, SERIAL_DAYS, SKIPPED, TWICE, TimeColumn, TimeReader
-from .units import heading_unit, suffix_unit
+from .units import heading_unit, suffix_unit, unknown_unit
 
 MAX_FRAME_BYTES = 64  # Bytes of the longest frame, of CAN FD
 
@@ -61,8 +61,8 @@ OPC_GOOD = 192
 MAX_TEXTS = 50  # Different texts of a column that are counted
 
 TAG = re.compile(
-    r"(^|[\W_])(id|ids|tag|tags|node|anchor|beacon|channel|sensor|point|signal|variable|item|metric|name|messstelle|"
-    r"kanal)$|[a-z](Id|ID|Tag|Name)$|(tag|sensor|point)_?name$",
+    r"(^|[\W_])(id|ids|tag|tags|node|anchor|beacon|channel|sensor|point|signal|variable|item|metric|name|field|series|"
+    r"messstelle|kanal)$|[a-z](Id|ID|Tag|Name)$|(tag|sensor|point)_?name$",
     re.IGNORECASE,
 )
 """Names of columns that name the source of a row."""
@@ -365,7 +365,10 @@ def _tables(files: list[Path], time: TimeColumn, dialect: Dialect) -> RecordingC
             f"{len(other)} columns have another number of rows than {chosen} and are left out: {shown}; name their "
             "own time column to read them"
         )
-    times, values = [], []
+    if strange := [name for name in columns if unknown_unit(name)]:
+        more = f" and of {len(strange) - 1} more" if len(strange) > 1 else ""
+        faults.append(f"the unit of {strange[0]}{more} is not known; give it under `units`")
+    times, values, zoneless = [], [], False
     counted: dict[str, list[str]] = {UNDATED: [], TWICE: [], SKIPPED: []}
     order = Order(time.label, time.unit, HORIZON_NS, lambda key, text: None if text in faults else faults.append(text))
     form = format_of(files[0])
@@ -373,7 +376,7 @@ def _tables(files: list[Path], time: TimeColumn, dialect: Dialect) -> RecordingC
         return _sparse(files, time, columns, order, faults)
     for path in files:
         for rows in _rows(path, time, columns, faults, counted, dialect):
-            time = time._replace(unit=rows.unit)
+            time, zoneless = time._replace(unit=rows.unit), zoneless or rows.zoneless
             times.append(rows.t[rows.known])
             values.append(rows.values[rows.known])
             order.check(path.name, rows.line[rows.known], times[-1])
@@ -389,6 +392,9 @@ def _tables(files: list[Path], time: TimeColumn, dialect: Dialect) -> RecordingC
         more = f"; so are {len(undated) - 1} more rows" if len(undated) > 1 else ""
         faults.append(undated[0] + more)
     t, v = np.concatenate(times), np.concatenate(values)
+    if zoneless and t[-1] > DATED_S * 1e9:
+        where = f"{files[0].name}: its dates"
+        faults.append(f"{where} have no time zone and are taken to be UTC; give one with --time-zone")
     wordy = [name for name, column in zip(columns, v.T, strict=True) if not np.isfinite(column).any()]
     texts = _texts(files, wordy, dialect)
     words = {key: key.removeprefix(NO_VALUE).partition(": ")[0] for key, rows in counted.items() if rows}
@@ -511,24 +517,32 @@ def _rows(
 
 
 def _time_of(path: Path, names: Sequence[str], time: TimeColumn, dialect: Dialect) -> str | None:
-    """Return the time column, by its name, as the first one of dates, or as the first that counts from 1970."""
+    """Return the time column, by its name, as the first one of dates, or as the first that counts from 1970.
+
+    Dates that stay the same, such as the begin and end of a query, are taken only if there are no others.
+    """
     able = [name for name in names if (heading_unit(name) or "s").lower() in TIME_UNITS]  # T [°C] is none.
     last = {_bare(name): name for name in reversed(able)}
     named = next((last[name] for name in TIME_NAMES if name in last), None)
     like = next((name for name in able if TIME_NAME.search(name)), None)
     if named is not None or (cells := cells_of(path, dialect)) is None:
         return named or like
-    row = next(cells, [])
-    for pattern in (None, CLOCK):
-        for name, cell in zip(names, map(str.strip, row), strict=False):
-            if cell.replace(",", "").replace(".", "").lstrip("+-").isdigit():
-                continue
-            if pattern.fullmatch(cell) if pattern else TimeReader(time._replace(name=name)).is_date(cell):
-                return name
-    if like is not None:
-        return like
-    rows = [one for one in (row, *islice(cells, MAX_TEXTS)) if len(one) == len(names)]
-    return next((name for k, name in enumerate(names) if _since_1970([cell[k] for cell in rows])), None)
+    rows = [[cell.strip() for cell in row] for row in islice(cells, MAX_TEXTS) if len(row) >= len(names)]
+    columns = dict(zip(names, zip(*rows, strict=False), strict=False))
+    texts = {
+        name: column
+        for name, column in columns.items()
+        if not column[0].replace(",", "").replace(".", "").lstrip("+-").isdigit()
+    }
+    moving = {name: column for name, column in texts.items() if len({*column}) > 1 or len(rows) == 1}
+    for among in (moving, texts):
+        for pattern in (None, CLOCK):
+            for name, column in among.items():
+                if pattern.fullmatch(column[0]) if pattern else TimeReader(time._replace(name=name)).is_date(column[0]):
+                    return name
+        if like is not None:
+            return like
+    return next((name for name, column in columns.items() if _since_1970(column)), None)
 
 
 def _bare(name: str) -> str:
@@ -538,7 +552,7 @@ def _bare(name: str) -> str:
     return base if base and unit in TIME_UNITS else text
 
 
-def _since_1970(cells: list[str]) -> bool:
+def _since_1970(cells: Sequence[str]) -> bool:
     """Return whether numbers rise and are times since 1970, in any unit."""
     try:
         numbers = np.array(cells, np.float64)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import re
+from contextlib import suppress
 from functools import lru_cache
 from typing import TYPE_CHECKING
 
@@ -14,45 +15,17 @@ if TYPE_CHECKING:
     import pint
 
 _SAME = {
-    "%": "percent",
-    "kmh": "km/h",
-    "kph": "km/h",
-    "km/hr": "km/h",
-    "Nm": "N*m",
-    "1/min": "rpm",
-    "U/min": "rpm",
-    "r/min": "rpm",
-    "rev/min": "rpm",
-    "min-1": "rpm",
-    "1/s": "Hz",
-    "m/s/s": "m/s**2",
-    "G": "standard_gravity",
-    "sec": "s",
-    "Volt": "V",
-    "volts": "V",
-    "Amp": "A",
-    "Amps": "A",
-    "Ohm": "ohm",
-    "celsius": "degC",
-    "Celsius": "degC",
-    "deg C": "degC",
-    "Deg C": "degC",
-    "DegC": "degC",
-    "degrees": "deg",
-    "PS": "metric_horsepower",
-    "As": "A*s",
-    "rev": "turn",
-    "Torr": "torr",
-    "cfm": "ft**3/min",
-    "kmph": "km/h",
-    "centigrade": "degC",
-}
+    "%": "percent", "kmh": "km/h", "kph": "km/h", "km/hr": "km/h", "Nm": "N*m", "1/min": "rpm", "U/min": "rpm",
+    "r/min": "rpm", "rev/min": "rpm", "min-1": "rpm", "1/s": "Hz", "m/s/s": "m/s**2", "G": "standard_gravity",
+    "sec": "s", "Amps": "A", "Ohm": "ohm", "degrees": "deg", "PS": "metric_horsepower", "As": "A*s", "rev": "turn",
+    "kmph": "km/h", "centigrade": "degC", "ft-lb": "ft*lbf", "lb-ft": "ft*lbf", "inWC": "inH2O", "psia": "psi",
+}  # fmt: skip
 """Spellings with one meaning (1/min on a bus is a rotation)."""
 
 _ANY_CASE = {
     word.lower(): word
-    for word in "rpm kph mph psi bar atm Hz kHz Pa hPa kPa kg kN kV kA kW kWh km h deg degC degF mmHg inHg".split()
-}
+    for word in "rpm kph mph kts psi bar atm Hz kHz Pa hPa kPa kg kN kV kA kW kWh km h deg degC degF mmHg inHg".split()
+} | {"cfm": "ft**3/min", "gpm": "gal/min", "lpm": "l/min"}
 """Words that mean one thing in capitals, too: K and H are no prefixes of the SI, but M and m are two."""
 
 _REFUSED = (
@@ -64,6 +37,11 @@ _REFUSED = (
     (
         re.compile(r"(?i:db[ (]*(m|w|v|uv|µv|a|b|spl|i|c|fs|u)?\)?|np)(/.*)?"),
         "is a logarithm, which no factor converts; convert the column first",
+    ),
+    (
+        re.compile(r"(?i:psi|(m|k)?bar|kPa)[ (]*[gG]\)?"),
+        "is a pressure above that of the atmosphere, which is not known; if the model's is one too, give the unit "
+        "without g under `units`",
     ),
     (re.compile(r"(?i:grad)(\W.*)?"), "may be a degree or a gon; give deg, degC or gon under `units`"),
     (
@@ -83,18 +61,11 @@ _OTHERWISE = {"g": "standard_gravity", "C": "degC", "F": "degF"}
 def _normal(unit: str) -> str:
     """Return one spelling of a unit: ASCII, with ** for powers."""
     text = unit.strip()
-    text = _SAME.get(text, text)
+    text = re.sub(r"\b[dD]eg(?:ree)?s? ?([CF])\b", r"deg\1", _SAME.get(text, text))
     for old, new in (
-        ("Ohm", "ohm"),
-        ("℃", "degC"),
-        ("°C", "degC"),
-        ("°F", "degF"),
-        ("°", "deg"),
-        ("·", "*"),
-        ("²", "**2"),
-        ("³", "**3"),
-        ("^", "**"),
-    ):
+        ("Ohm", "ohm"), ("℃", "degC"), ("°C", "degC"), ("°F", "degF"), ("°", "deg"), ("·", "*"), ("²", "**2"),
+        ("³", "**3"), ("^", "**"),
+    ):  # fmt: skip
         text = text.replace(old, new)
     text = re.sub(r"\b([kmMc]?)N(c?m)\b", r"(\1N*\2)", text)
     return re.sub(r"(?<=[A-Za-z])(?=\d)", "**", text) if "/" in text or text[-1:].isdigit() else text
@@ -107,8 +78,9 @@ def _refusal(unit: str) -> str | None:
 
 def _spellings(normal: str) -> dict[str, None]:
     """Return a normal spelling, and what else it may mean."""
+    words = re.sub(r"\b[A-Z][a-z]{2,}\b", lambda match: match[0].lower(), normal)
     cased = re.sub(r"[A-Za-z]+", lambda match: _ANY_CASE.get(match[0].lower(), match[0]), normal)
-    return dict.fromkeys((normal, _OTHERWISE.get(normal, normal), cased))
+    return dict.fromkeys((normal, _OTHERWISE.get(normal, normal), cased, words))
 
 
 @lru_cache(maxsize=1)
@@ -240,29 +212,36 @@ def _has_dimension(unit: str) -> bool:
         return unit not in ("", "-")
 
 
-_HEADING = re.compile(r".+?\s*[\[(]([^\[\]()]+)[\])]\s*")
+_HEADING = re.compile(r".+?\s*[\[(]([^\[\](),]+)[\])]\s*")
+_COMMA = re.compile(r".+, *([^,()\[\]]+?) *(?:\([^()]*\))?")  # Temp, °C (LGR S/N: 2012, SEN S/N: 2013)
 
 _ELEMENT = re.compile(r"/\S+\.\S+\[[^\[\]]+\]")
 """Element of a field of a ROS topic, whose name is no unit: /joint_states.position[arm]."""
 
 
 def heading_unit(name: object) -> str | None:
-    """Return the unit in a column's heading, such as `Level [mm]` or `Level (mm)`; None if there is no known one."""
+    """Return the unit in a heading, such as `Level [mm]`, `Level (mm)` or `Level, mm`; None if it has no known one."""
     if not isinstance(name, str) or _ELEMENT.fullmatch(name):
         return None
-    match = _HEADING.fullmatch(name)
-    if match is None or not re.search(r"[A-Za-z°%]", match[1]):
-        return None
-    text = match[1].strip()
-    if _refusal(text):
-        return text
-    for spelling in _spellings(_normal(text)):
-        try:
-            _unit(spelling)
-        except LookupError:
-            continue
-        return text
+    for match in filter(None, (form.fullmatch(name) for form in (_HEADING, _COMMA))):
+        if re.search(r"[A-Za-z°%]", text := match[1].strip()) and _is_known(text):
+            return text
     return None
+
+
+def unknown_unit(name: str) -> bool:
+    """Return whether the heading of a column ends with a word in brackets that is no known unit."""
+    match = _HEADING.fullmatch(name)
+    return match is not None and bool(re.fullmatch(r"[^\W\d]\S*", match[1])) and heading_unit(name) is None
+
+
+def _is_known(text: str) -> bool:
+    """Return whether a text is a unit, or one that is refused."""
+    for spelling in _spellings(_normal(text)):
+        with suppress(LookupError):
+            _unit(spelling)
+            return True
+    return _refusal(text) is not None
 
 
 _SUFFIXES = {

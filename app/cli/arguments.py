@@ -109,7 +109,7 @@ class TableOptions:
     time_format: str | None = None
     """Format of its dates, for example "%m/%d/%Y %H:%M:%S". Default: detected."""
     time_zone: str | None = None
-    """Time zone of dates without an offset, for example Europe/Berlin. Default: UTC."""
+    """Time zone of dates without an offset, as Europe/Berlin or +01:00. Default: that of the heading, else UTC."""
     heading: str | None = None
     """Line with the names of the columns of a table, or none. Default: detected."""
     delimiter: str | None = None

@@ -3,12 +3,13 @@
 from __future__ import annotations
 
 from pathlib import Path
-from zoneinfo import available_timezones
 
 import numpy as np
+from pydantic_core import PydanticCustomError
 
+from config.source_schema import known_zone
 from estimators.diagnostics.repeats import find_repeats
-from estimators.errors import ConfigError, nearest, quoted
+from estimators.errors import ConfigError, quoted
 from sources.can.ids import shown_id
 from sources.can.readers import EXTENDED, BusName
 from sources.formats import files_of
@@ -82,9 +83,10 @@ def contents_of(files: tuple[Path, ...], options: TableOptions) -> RecordingCont
     units = [*UNITS, *SERIAL_DAYS]
     if options.time_unit not in units:
         raise ConfigError(f"--time-unit {options.time_unit}: is no unit of time; choose from {', '.join(units)}")
-    if options.time_zone is not None and options.time_zone not in available_timezones():
-        remedy = nearest(options.time_zone, available_timezones())
-        raise ConfigError(f"--time-zone {options.time_zone}: is no time zone of this machine; {remedy}")
+    try:
+        zone = options.time_zone and known_zone(options.time_zone)
+    except PydanticCustomError as error:
+        raise ConfigError(f"--time-zone {options.time_zone}: {error.message()}") from None
     files, databases = tuple(one for file in files for one in files_of(file.expanduser())), databases_of(options)
     for path, _ in databases:
         if not path.is_file():
@@ -94,7 +96,7 @@ def contents_of(files: tuple[Path, ...], options: TableOptions) -> RecordingCont
         raise ConfigError(f"--dbc {databases[0][0]}: describes CAN logs, and {files[0]} is a table; leave it out")
     if options.time and tables and not any(tables):
         raise ConfigError(f"--time {quoted(options.time)}: is for tables, and {files[0]} is a CAN log; leave it out")
-    time = TimeColumn(options.time or "", options.time_unit, options.time_format, options.time_zone)
+    time = TimeColumn(options.time or "", options.time_unit, options.time_format, zone)
     how = dialect_of(options.heading, options.delimiter, options.decimal, options.skip, options.sheet, "--")
     more = f" and {len(files) - 1} more" if len(files) > 1 else ""
     return attend(None, lambda: inspect_recordings(files, databases, time, how), f"reading {files[0].name}{more}")

@@ -113,8 +113,8 @@ def _plain(line: str) -> str:
 
 def _stamp(zone: str | None, t: int) -> float:
     """Return the seconds since 1970 of a local time, ns; a zone that is None is UTC."""
-    local = datetime.fromtimestamp(t // 10**9, UTC)
-    return local.replace(tzinfo=ZoneInfo(zone) if zone else UTC).timestamp() + t % 10**9 * 1e-9
+    known = datetime.strptime(zone, "%z").tzinfo if zone and zone[0] in "+-" else zone and ZoneInfo(zone)
+    return datetime.fromtimestamp(t // 10**9, UTC).replace(tzinfo=known or UTC).timestamp() + t % 10**9 * 1e-9
 
 
 class TextLog(TextIOMessageReader):

@@ -35,7 +35,7 @@ QUALITY_WORD = re.compile(
 
 TIME_NAMES = (
     "time", "timestamp", "t", "ts", "seconds", "time_s", "t_s", "date", "datetime", "unix_time", "elapsed", "zeit",
-    "zeitstempel", "datum", "horodatage", "fecha",
+    "zeitstempel", "datum", "horodatage", "fecha", "x_value",
 )  # fmt: skip
 """Usual names of a time column, the surest first; else the first of dates, or the first that is named like one."""
 
@@ -153,6 +153,12 @@ def format_of(path: Path, head: bytes, given: Dialect = DETECTED) -> CsvFormat:
         lines.pop()  # It is cut.
     if separator := re.fullmatch(r'"?sep=(.)"?\s*', lines[0] if lines else "", re.IGNORECASE):
         given = given._replace(delimiter=given.delimiter or separator[1], skip=max(given.skip, 1))
+    begin, types, rows = (next((k for k, one in enumerate(lines) if mark.match(one)), -1) for mark in _IGNITION)
+    if 0 <= begin < types < rows:
+        lines[begin], lines[types : rows + 1] = "\n", "\n" * (rows + 1 - types)
+    if ends := [k for k, one in enumerate(lines, 1) if one.startswith("***End_of_Header***")][:2]:  # LabVIEW's .lvm
+        lines[: ends[-1]] = "\n" * ends[-1]
+        lines[ends[-1] :] = [re.sub(r"^(X_Value.*)\WComment\s*$", r"\1\n", one) for one in lines[ends[-1] :]]
     if given.heading and not "".join(lines[given.heading - 1 : given.heading]).strip(f"\r\n{DELIMITERS}"):
         raise SourceError(f"{path}: its heading is to be line {given.heading}, which is blank or not there; correct it")
     first = lines[given.skip] if given.skip < len(lines) else ""
@@ -163,7 +169,12 @@ def format_of(path: Path, head: bytes, given: Dialect = DETECTED) -> CsvFormat:
         line, delimiter = given.heading or given.skip + 1, tables[0].delimiter
         names = [name.strip() for name in next(_reader(lines[line - 1 : line], delimiter), [])]
         return CsvFormat(names, delimiter, given.decimal or ".", encoding, line + 1)
-    return best.format(path, encoding)
+    found = best.format(path, encoding)
+    return found._replace(first=max(found.first, rows + 2 if begin >= 0 else 0))
+
+
+_IGNITION = [re.compile(rf'"?#{word}\b') for word in ("NAMES", "TYPES", "ROWS")]
+"""Lines before the names, the types and the rows in an export of Ignition; only the names are of the heading."""
 
 
 def _encoding(head: bytes) -> str:
@@ -289,7 +300,10 @@ class _Table:
                 names = [_with_unit(name, cells[k]) if k in of_numbers else name for k, name in enumerate(names)]
             if given.heading is None and (heading.line > given.skip + 1 or units):
                 remarks.append(f"heading in line {heading.line}")
-            remarks += [f"units in line {row.line}" for row in units]
+            for row in units:
+                strange = [cell for cell in row.cells if cell.strip("[]() ") not in NO_UNITS and not _unit_in(cell)]
+                unknown = f" (not known: {', '.join(strange)}; give them under `units`)" if strange else ""
+                remarks.append(f"units in line {row.line}{unknown}")
         else:
             width = self._width - self._ragged
             names, first = [f"c{k}" for k in range(1, width + 1)], rows[0].line
@@ -343,9 +357,12 @@ def _timed(row: _Row) -> int:
     return 2 if set(names) & set(TIME_NAMES) else int(any(map(TIME_NAME.search, names)))
 
 
+NO_UNITS = ("-", "", "1", "unitless", "TS", "RN")  # TS and RN are those of time and number of a Campbell logger
+
+
 def _unit_in(cell: str) -> str:
     """Return the unit that a cell of a row of units gives; empty if it gives none."""
-    return heading_unit(f"x [{cell.strip('[]() ')}]") or ""
+    return "" if (text := cell.strip("[]() ")) in NO_UNITS else heading_unit(f"x [{text}]") or ""
 
 
 def _unit_rows(block: Sequence[_Row]) -> list[_Row]:
@@ -353,8 +370,9 @@ def _unit_rows(block: Sequence[_Row]) -> list[_Row]:
     found = []
     for row in block[1:]:
         cells = [cell for cell in row.cells if cell]
-        share = sum(cell.strip("[]() ") in ("-", "", "1") or bool(_unit_in(cell)) for cell in cells) / len(cells)
-        if any(map(_unit_in, cells)) and (share == 1.0 or (share >= 0.5 and _timed(row) < 2)):
+        share = sum(cell.strip("[]() ") in NO_UNITS or bool(_unit_in(cell)) for cell in cells) / len(cells)
+        timed = _timed(row) == 2 > max(_timed(one) for one in block if one.line < row.line)  # a row of names
+        if any(map(_unit_in, cells)) and (share == 1.0 or (share >= 0.5 and not timed)):
             found.append(row)
     return found
 

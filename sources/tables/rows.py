@@ -57,6 +57,7 @@ class TableRows(NamedTuple):
     """Rows of a table: line (or row) of each, time (ns) and whether it is known, values (n, columns), mask of blanks.
 
     `problems` are those found on the way: key, line, text. `words`: see `Chunk`. `unit` is that of the times.
+    `zoneless` tells whether dates before or in them have no time zone.
     """
 
     line: np.ndarray
@@ -67,6 +68,7 @@ class TableRows(NamedTuple):
     problems: tuple[tuple[str, int, str], ...]
     words: tuple[str, ...] = ()
     unit: str = "s"
+    zoneless: bool = False
 
 
 def format_of(path: Path) -> TableFormat | None:
@@ -185,7 +187,17 @@ def read_rows(
     if problems:
         none = np.zeros(0, np.int64)
         nothing = np.zeros((0, len(columns)))
-        yield TableRows(none, none, none.astype(np.bool_), nothing, nothing.astype(np.bool_), taken())
+        yield TableRows(
+            none,
+            none,
+            none.astype(np.bool_),
+            nothing,
+            nothing.astype(np.bool_),
+            taken(),
+            (),
+            times.unit,
+            times.zoneless,
+        )
 
 
 def dated(chunk: Chunk, times: TimeReader, time: TimeColumn, problems: list[tuple[str, int, str]]) -> TableRows:
@@ -195,7 +207,7 @@ def dated(chunk: Chunk, times: TimeReader, time: TimeColumn, problems: list[tupl
         problems.append((UNDATED, int(chunk.line[row]), _undated(time, chunk.time[row])))
     problems += [(key, int(chunk.line[row]), text) for row, key, text in times.notes]
     times.notes.clear()
-    return TableRows(chunk.line, t, known, chunk.values, chunk.blank, (), chunk.words, times.unit)
+    return TableRows(chunk.line, t, known, chunk.values, chunk.blank, (), chunk.words, times.unit, times.zoneless)
 
 
 def _undated(time: TimeColumn, cell: object) -> str:

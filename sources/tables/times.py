@@ -41,6 +41,9 @@ _WHOLE_CLOCK = re.compile(r"(?:[01]\d|2[0-3])[0-5]\d[0-5]\d(?:\.\d*)?")  # 08001
 _NAMED_DAY = re.compile(r"(?<!\d)((?:19|20)\d\d)([-_.]?)(0[1-9]|1[0-2])\2(0[1-9]|[12]\d|3[01])(?!\d)")
 """A date in the name of a file."""
 
+_OFFSET = re.compile(r"(?<![^\W_])(?:UTC|GMT)(?:\s*([+-])\s*(\d\d?)(?::?(\d\d))?)?(?![^\W_])", re.IGNORECASE)
+"""An offset from UTC in a heading: Date Time, GMT-05:00; Time (UTC+1)."""
+
 MAX_CLOCK_STEP_BACK_NS = 3600 * 10**9  # By which a clock without a date goes back within one day
 TWICE, SKIPPED, ASSUMED = "hour that occurs twice", "hour that never occurs", "time assumed"
 """Keys of notes: times that follow from the order of the rows, and assumptions made once for all rows."""
@@ -53,7 +56,8 @@ class TimeColumn(NamedTuple):
     """The column that holds the time.
 
     unit: Of numbers, a key of `UNITS` or `SERIAL_DAYS`. format: Of dates, as in `datetime.strptime`; None detects it.
-    zone: Time zone of dates without an offset, for example Europe/Berlin; None is UTC. clock: Second column, of a CSV,
+    zone: Time zone of dates without an offset, for example Europe/Berlin or +01:00; None is that in the heading, else
+    UTC. clock: Second column, of a CSV,
     whose cells follow those of the first. date: ISO date of the first row if the cells are clocks without one.
     shift: Seconds that a table adds to the times.
     """
@@ -83,7 +87,8 @@ class TimeReader:
     A clock without a date begins at the column's `date`, or that in the name of the file `path`, and passes midnight
     when it goes back by more than an hour. Without a file, it is no time. Numbers that are too large for seconds are of
     the unit in which the first one is a time between 1990 and 2060; those that all spell a date (20240315) or a clock
-    (080010) are read so. `notes` are rows of the last chunk whose time was assumed: row, key, text.
+    (080010) are read so. `notes` are rows of the last chunk whose time was assumed: row, key, text. `zoneless` tells
+    whether there was a date without a time zone.
 
     Raises:
         SourceError: If dates may be day/month as well as month/day, or the zone is unknown.
@@ -105,7 +110,10 @@ class TimeReader:
         self._spelt: str | None = None if self._seconds and column.format is None else ""  # what numbers spell
         self._origin = days or 0
         self._order: str | None = None
-        self._summer = _SummerTime(column, self.notes) if column.zone is not None else None
+        self.zoneless, self._heading, zone = False, None, column.zone
+        if zone is None and (offset := _OFFSET.search(column.label)):
+            self._heading = zone = f"{offset[1] or '+'}{offset[2] or '0':0>2}:{offset[3] or '00'}"
+        self._summer = _SummerTime(column._replace(zone=zone), self.notes) if zone is not None else None
 
     def read(self, cells: list[str] | pyarrow.Array) -> tuple[np.ndarray, np.ndarray]:
         """Return times (ns), and a mask of the rows that have one.
@@ -244,7 +252,12 @@ class TimeReader:
     def _local(self, t: np.ndarray, local: np.ndarray) -> np.ndarray:
         """Return times in UTC; those in the mask `local` are of the zone."""
         if self._summer is None or not local.any():
+            self.zoneless |= bool(local.any())
             return t
+        if self._heading not in (None, "+00:00"):
+            text = f"{self._column.label} is taken as local time of UTC{self._heading}, by its heading"
+            self.notes.append((0, ASSUMED, f"{text}; set the time's zone (time.zone, --time-zone) to be sure"))
+            self._heading = None
         t = t.copy()
         rows = np.flatnonzero(local)
         t[rows] = self._summer.to_utc(t[rows], rows)

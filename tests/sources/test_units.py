@@ -65,3 +65,19 @@ def test_a_declared_unit_of_a_quantity_without_unit_is_refused():
     for declared, found in (("%", None), ("-", "m"), (None, "furlong"), ("", "m")):
         assert declared_conversion(declared, found, "", "x") == (1.0, 0.0)
     assert declared_conversion("km/h", "mph", "m/s", "x")[0] == pytest.approx(1 / 3.6)
+
+
+@pytest.mark.parametrize(
+    ("heading", "unit"),
+    [
+        ("Temp, °C (LGR S/N: 20123456, SEN S/N: 20123456)", "°C"),  # of an Onset HOBO
+        ("RH, % (LGR S/N: 20123456, SEN S/N: 20123456, LBL: In)", "%"),
+        ("Flow, gpm", "gpm"),
+        ("Level, m [mm]", "mm"),
+        ("Host Connected (LGR S/N: 20123456)", None),
+        ("Date Time, GMT-05:00", None),
+        ("Mean (TT1, TT2)", None),
+    ],
+)
+def test_a_unit_may_follow_a_comma(heading, unit):
+    assert heading_unit(heading) == unit

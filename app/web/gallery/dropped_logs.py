@@ -33,8 +33,8 @@ JOB_TIMEOUT_S = 600.0  # Longest time between two items of a job; the page shows
 
 OPTION_WORDS = {
     "--hold-out ": "held out: ", "--inputs ": "input: ", "--sensors ": "sensor: ", "--states ": "state: ",
-    "--signals ": "signal: ", " with --inputs": "", " with --dbc": "", " with --time": "", "(--time-unit)": "",
-    "add --time-unit excel": "choose Excel dates",
+    "--signals ": "signal: ", " with --inputs": "", " with --dbc": "", " with --time-zone": "",
+    " with --time": "", "(--time-unit)": "", "add --time-unit excel": "choose Excel dates",
 }  # fmt: skip
 """Options in messages of the command line, as the page has them."""
 

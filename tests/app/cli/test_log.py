@@ -248,3 +248,21 @@ def test_a_format_that_fits_no_row_is_refused_also_after_a_remark(tmp_path, nisu
     )
     read = nisus("log", str(tmp_path / "a.csv"), "--time-format", "%m/%d/%y %I:%M:%S %p", "--json").json
     assert read["start_ns"] == 1_772_697_600 * 10**9  # date -u -d 2026-03-05T08:00 +%s
+
+
+@pytest.mark.parametrize(("zone", "written"), [("UTC+1", "+01:00"), ("+01:00", "+01:00"), ("Etc/GMT-1", "Etc/GMT-1")])
+def test_a_time_zone_may_be_an_offset_which_the_twin_keeps(tmp_path, nisus, zone, written):
+    rng = np.random.default_rng(2)
+    rows = [f"2024-03-15 09:{k // 60:02}:{k % 60:02},{x:.3f}\n" for k, x in enumerate(np.cumsum(rng.normal(0, 1, 300)))]
+    (tmp_path / "a.csv").write_text("time,x\n" + "".join(rows))
+    options = "--log", str(tmp_path / "a.csv"), "--time-zone", zone
+    assert "no time zone" not in nisus("new", "made", "--folder", tmp_path, *options).err
+    assert f'zone: "{written}"}}' in (tmp_path / "made.yaml").read_text()
+    assert (
+        nisus("log", *options[1:], "--json").json["start_ns"] == 1_710_489_600 * 10**9
+    )  # date -u -d 2024-03-15T08 +%s
+    loaded = load_twin(tmp_path / "made.yaml")
+    assert loaded.config.source.time.zone == written
+    (tmp_path / "made.yaml").write_text((tmp_path / "made.yaml").read_text().replace(written, "+25:00"))
+    assert "is no time zone of this machine" in nisus.refuses("fold", str(tmp_path / "made.yaml"))
+    assert "--time-zone +25:00: is no time zone" in nisus.refuses("log", options[1], "--time-zone", "+25:00")

@@ -163,8 +163,9 @@ def test_the_date_of_an_asc_log_is_the_start_of_its_times(tmp_path, head, start)
 def test_the_zone_of_the_logger_applies_to_its_dates(tmp_path):
     path = tmp_path / "a.asc"
     path.write_text(HEADER.format(date="Sat Sep 30 15:06:13.191 2017") + FRAMES)
-    found, faults = keys_and_times(path, "Europe/Berlin")
-    assert found[0][3] == [pytest.approx(SATURDAY - 7200 + 0.01)] and not faults  # summer time
+    for zone in ("Europe/Berlin", "+02:00"):  # summer time
+        found, faults = keys_and_times(path, zone)
+        assert found[0][3] == [pytest.approx(SATURDAY - 7200 + 0.01)] and not faults
     got = read_all(CanLog([path], decoder_of(tmp_path), zone="Europe/Berlin"))
     assert got.t[0] / 1e9 == pytest.approx(SATURDAY - 7200 + 0.01, abs=1e-6)
 

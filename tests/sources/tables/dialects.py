@@ -112,6 +112,27 @@ SAMPLES = {
         "heading in line 2, units in line 3",
         {"skiprows": 4, "names": NAMES},
     ),
+    "ignition": Sample(
+        '"#NAMES"\n"time","TT101","FT201"\n"#TYPES"\n"D","F","F"\n"#ROWS","40"\n' + body(quote='"'),
+        NAMES,
+        "heading in line 2",
+        {"skiprows": 5, "names": NAMES},
+    ),
+    "ignition_bare": Sample(
+        "#NAMES\n" + HEAD + "#TYPES\nD,F,F\n#ROWS,40\n" + body(),
+        NAMES,
+        "heading in line 2",
+        {"skiprows": 5, "names": NAMES},
+    ),
+    "labview": Sample(
+        "LabVIEW Measurement\t\nSeparator\tTab\nDecimal_Separator\t.\nX_Columns\tOne\nDate\t2024/03/15\n"
+        "Time\t08:00:00.1234567890123456789\n***End_of_Header***\t\n\t\nChannels\t2\t\t\nSamples\t40\t40\t\n"
+        "Date\t2024/03/15\t2024/03/15\t\nY_Unit_Label\tVolts\tDeg C\t\nX0\t0.0000E+0\t0.0000E+0\t\n"
+        "Delta_X\t0.500000\t0.500000\t\n***End_of_Header***\t\t\t\nX_Value\tTT101\tFT201\tComment\n" + body("\t"),
+        ("X_Value", "TT101", "FT201"),
+        "heading in line 16",
+        {"sep": "\t", "skiprows": 16, "names": NAMES},
+    ),
     "no_heading": Sample(body(), ("c1", "c2", "c3"), "no heading, so columns are named c1 to c3", {"header": None}),
     "trailing": Sample(HEAD + body(after=","), NAMES, "", {"index_col": False}),
     "trailing_all": Sample(HEAD[:-1] + ",\n" + body(after=","), NAMES, "", {"usecols": NAMES}),

@@ -201,3 +201,34 @@ def test_the_formats_that_are_offered_read_the_cell(cell, form):
     with pytest.raises(SourceError, match=f'"{form}" or '):
         read(cell)
     assert read(cell, format=form) != [None]
+
+
+@pytest.mark.parametrize(
+    ("heading", "ahead_s", "said"),
+    [
+        ("Date Time, GMT-05:00", -18_000, "-05:00"),  # of an Onset HOBO
+        ("Time (UTC+01:00)", 3600, "+01:00"),
+        ("Zeit GMT+0530", 19_800, "+05:30"),
+        ("time_utc+1", 3600, "+01:00"),
+        ("timestamp_utc", 0, ""),
+        ("Date Time (UTC)", 0, ""),
+    ],
+)
+def test_an_offset_in_the_heading_is_that_of_its_dates(tmp_path, heading, ahead_s, said):
+    (tmp_path / "a.csv").write_text(f'"{heading}",x\n03/15/24 08:00:00 AM,1\n03/15/24 08:00:01 AM,2\n')
+    found = inspect_recordings([tmp_path / "a.csv"])
+    assert found.t.tolist() == [MOMENT_NS - ahead_s * 10**9, MOMENT_NS + (1 - ahead_s) * 10**9]
+    rule = (
+        f"a.csv:2: {heading} is taken as local time of UTC{said}, by its heading; set the time's zone (time.zone, --t"
+    )
+    assert [text.startswith(rule) for text in found.faults] == [True] * bool(said)
+    utc = inspect_recordings([tmp_path / "a.csv"], time=TimeColumn(heading, zone="UTC"))
+    assert utc.t[0] == MOMENT_NS and not utc.faults
+
+
+@pytest.mark.parametrize("rows", [("2024-03-15 08:00", "2024-03-15 08:01"), ("1.5.24 08:00 UTC", "1.5.24 08:01 UTC")])
+def test_dates_without_a_time_zone_are_said_to_be_utc(tmp_path, rows):
+    (tmp_path / "a.csv").write_text("time,x\n" + "".join(f"{row},1\n" for row in rows))
+    line = "a.csv: its dates have no time zone and are taken to be UTC; give one with --time-zone"
+    assert inspect_recordings([tmp_path / "a.csv"]).faults == [line] * ("UTC" not in rows[0])
+    assert inspect_recordings([tmp_path / "a.csv"], time=TimeColumn("time", zone="Europe/Berlin")).faults == []

@@ -185,3 +185,67 @@ def test_rows_with_more_cells_are_left_out_unless_these_are_blank(tmp_path):
     events = read(path, TimeColumn("time"), ["TT101"], report=reports)
     assert (events.t // 10**9).tolist() == [0, 2, 3]
     assert reports.texts["unreadable value"] == "drive.csv:3: has 4 cells, not 3; the row is left out"
+
+
+def test_the_times_and_the_series_of_an_annotated_csv_are_those_of_its_rows(tmp_path):
+    """Annotated CSV of InfluxDB: _start and _stop are those of the query, _field names the series."""
+    head = (
+        "#group,false,false,true,true,false,false,true,true\n"
+        "#datatype,string,long,dateTime:RFC3339,dateTime:RFC3339,dateTime:RFC3339,double,string,string\n"
+        "#default,_result,,,,,,,\n,result,table,_start,_stop,_time,_value,_field,_measurement\n"
+    )
+    query = "2024-03-15T08:00:00Z,2024-03-15T09:00:00Z"
+    rows = (
+        f",,{table},{query},2024-03-15T08:00:{second:02d}Z,{10 * table + second / 8},{field},tank\n"
+        for table, field in enumerate(("temp", "level"))
+        for second in range(30)
+    )
+    found = inspect_recordings([write(tmp_path, head + "".join(rows))])
+    assert found.time.name == "_time" and found.by == "_field"
+    assert np.unique(found.t).tolist() == [(1_710_489_600 + second) * 10**9 for second in range(30)]
+    series = {one.name: one.values.tolist() for one in found.columns if one.only}
+    assert series["_value_temp"] == [k / 8 for k in range(30)]
+    assert series["_value_level"] == [10 + k / 8 for k in range(30)]
+
+
+@pytest.mark.parametrize(
+    ("text", "time"),
+    [
+        ("from,Uhr\n2024-03-15,08:00:00\n2024-03-15,08:00:01\n", "from"),  # a date and a clock are both taken
+        ("from,at,x\n2024-03-15 08:00,2024-03-15 08:01,1\n2024-03-15 08:00,2024-03-15 08:02,2\n", "at"),
+        ("from,x,my time\n2024-03-15 08:00,1,0.5\n2024-03-15 08:00,2,1.5\n", "my time"),
+        ("from,x\n2024-03-15 08:00,1\n2024-03-15 08:00,2\n", "from"),
+        ("from,x,my time\n2024-03-15 08:00,1,0.5\n", "from"),
+    ],
+)
+def test_a_date_that_stays_the_same_is_a_time_only_if_there_is_no_other(tmp_path, text, time):
+    assert inspect_recordings([write(tmp_path, text)]).time.name == time
+
+
+def test_the_units_of_a_campbell_logger_are_those_of_its_second_row(tmp_path):
+    """TOA5: line of the logger, names, units (TS and RN of time and record), and how each was processed."""
+    head = (
+        '"TOA5","CR1000","CR1000","1011","CR1000.Std.22","CPU:a.CR1","19246","Table1"\n'
+        '"TIMESTAMP","RECORD","BattV_Avg","AirTC_Avg","WS","Turb"\n'
+        '"TS","RN","Volts","Deg C","meters/second","NTU"\n"","","Avg","Avg","Smp","Smp"\n'
+    )
+    rows = "".join(f'"2024-03-15 08:{k:02}:00",{k},12.5,2{k % 10}.5,{k % 7},{k % 5}.1\n' for k in range(40))
+    found = inspect_recordings([write(tmp_path, head + rows)])
+    units = {one.name: one.unit for one in found.columns}
+    assert units == {
+        "RECORD": "",
+        "BattV_Avg [Volts]": "Volts",
+        "AirTC_Avg [Deg C]": "Deg C",
+        "WS [meters/second]": "meters/second",
+        "Turb": "",
+    }
+    assert found.faults[0] == (
+        "drive.csv: heading in line 2, units in line 3 (not known: NTU; give them under `units`)"
+    )
+
+
+def test_the_unit_of_a_heading_that_is_not_known_is_said(tmp_path):
+    rows = "".join(f"{k},{k},{k},{k}\n" for k in range(9))
+    found = inspect_recordings([write(tmp_path, "t,A [NTU],B (cfu),C [bar]\n" + rows)])
+    assert found.faults[0] == "the unit of A [NTU] and of 1 more is not known; give it under `units`"
+    assert [one.unit for one in found.columns] == ["", "", "bar"]
