@@ -176,7 +176,8 @@ def test_serial_dates_that_are_read_as_seconds_are_named(tmp_path, unit, day):
     line = f"column t looks like serial dates of {unit}: add --time-unit {unit}"
     assert inspect_recordings([path]).faults == [line]
     found = inspect_recordings([path], time=TimeColumn("t", unit))
-    assert found.faults == [] and found.t[0] == pytest.approx(MOMENT_NS, abs=10**6)
+    zone = "log.csv: its dates have no time zone and are taken to be UTC; give one with --time-zone"
+    assert found.faults == [zone] and found.t[0] == pytest.approx(MOMENT_NS, abs=10**6)
 
 
 def test_the_months_of_a_two_digit_year_are_told_by_its_formats():
