@@ -1,4 +1,4 @@
-"""`nisus advise`: recommend an estimator for a twin from its log, or draft a twin from recordings."""
+"""`nisus advise`: recommend an estimator for a twin from its log, or the roles of a recording's signals."""
 
 from __future__ import annotations
 
@@ -14,9 +14,9 @@ from estimators.log import READING, Log
 from ..format_time import counted
 from ..render.text import to_text
 from ..result import JsonObject, TableColumn, Topic, to_json
-from ..study.advice.draft import check_new, hint_lines, write_draft
+from ..study.advice.draft import hint_lines
 from ..study.advice.measured import AdviceProgress, Measured, digits, percent, seconds_text, without_faults
-from ..study.advice.plan import DraftPlan, Moves, plan, redundant, unit_ratio
+from ..study.advice.plan import OMISSIONS, DraftPlan, Moves, plan, redundant, unit_ratio
 from ..study.advice.relations import Pair
 from ..study.advice.signals import Signal, signals
 from ..study.advice.verdict import Advice, advice_json, changed, details, exclusion_text, finding, lasting_lines, lines
@@ -24,14 +24,14 @@ from ..study.advice.verdict import advise as recommend
 from ..twin.log_reader import read_log
 from ..twin.twin import Twin, load_twin
 from .arguments import AdviseCommand as Arguments
-from .log import contents_of, databases_of
-from .new import fit_draft, report_draft, roles_json
+from .log import contents_of
+from .new import roles_json
 from .options import check_output, overrides_of, roles_of
 from .prepare import attend, prepare
 
 MAX_LISTED_SIGNALS = 40
 
-KINDS = {"switch": "a switch", "counter": "time, counter or status", "constant": "constant", "short": "too few values"}
+WRITE_DRAFT = "nisus new NAME --log FILE writes the draft of a recording, fitted and checked"
 
 
 def advise(arguments: Arguments) -> int:
@@ -43,8 +43,8 @@ def advise(arguments: Arguments) -> int:
     whole = [what for what in arguments.what if what not in shipped() and Path(what).is_dir()]
     twins = [what for what in arguments.what if what in shipped() or Path(what).suffix in (".yaml", ".yml")]
     if not twins and all(Path(what).suffix or what in whole for what in arguments.what):
-        if arguments.apply or arguments.log or arguments.set or arguments.estimator:
-            raise ConfigError("--apply, --log, --set and --estimator are for a twin; a recording is drafted with --out")
+        if any((arguments.apply, arguments.out, arguments.log, arguments.set, arguments.estimator)):
+            raise ConfigError(f"--apply, --out, --log, --set and --estimator are for a twin; {WRITE_DRAFT}")
         return _draft(arguments, tuple(Path(what) for what in arguments.what))
     if len(arguments.what) > 1:
         raise ConfigError(f"{arguments.what[1]}: one twin at a time; name its recordings with --log")
@@ -104,25 +104,13 @@ def _topics(twin: Twin, log: Log, advice: Advice) -> list[Topic]:
 
 
 def _draft(arguments: Arguments, files: tuple[Path, ...]) -> int:
-    """Draft a twin from recordings."""
+    """Print what a draft of recordings would be made of."""
     found = contents_of(files, arguments)
     drafted, every = plan(found, roles_of(arguments)), signals(found)
-    if arguments.out is not None:
-        if arguments.out.suffix not in (".yaml", ".yml", ""):
-            raise ConfigError(f"--out {arguments.out}: must end in .yaml")
-        check_new(arguments.out.stem, arguments.out.parent)
-        drafted = fit_draft(drafted)
     if arguments.json:
         print(to_json(_draft_json(every, drafted)))
     else:
-        print(to_text([_signals_topic(every), *_plan_topics(drafted)]))
-    if arguments.out is not None:
-        written = write_draft(drafted, found, arguments.out.stem, arguments.out.parent, databases_of(arguments))
-        if not arguments.json:
-            print()
-            report_draft(written, False)
-    elif not arguments.json:
-        print("\nWrite the draft with --out NAME.yaml, which fits its noises and checks it.")
+        print(to_text([_signals_topic(every), *_plan_topics(drafted)]), f"\n{WRITE_DRAFT}.", sep="\n")
     return 0
 
 
@@ -138,7 +126,7 @@ def _signals_topic(every: list[Signal]) -> Topic:
             one.levels,
             one.resolution,
             one.noise,
-            KINDS.get(
+            OMISSIONS.get(
                 one.kind,
                 "an angle that wraps"
                 if one.wraps
@@ -239,5 +227,5 @@ def _draft_json(every: list[Signal], drafted: DraftPlan) -> JsonObject:
             for item in drafted.states
         ],
         "inputs": [name for name, _ in drafted.inputs],
-        **roles_json(drafted),
+        "roles": roles_json(drafted)["roles"],
     }

@@ -270,14 +270,14 @@ class CheckCommand(JsonOption, ClusterOption, FoldOptions):
 
 @dataclass(frozen=True)
 class AdviseCommand(JsonOption, RoleOptions, TableOptions, LogOptions, EstimatorOption):
-    """Recommend an estimator for a twin from its log, or draft a twin from recordings.
+    """Recommend an estimator for a twin from its log, or roles of the signals of recordings.
 
     For a twin: the simplest estimator whose assumptions hold on the log, with the figure behind each claim and the
     lines for its YAML. For recordings: sample rates, gaps, noise, redundant signals, and drivers of each signal.
 
     Examples:
       nisus advise motor_can
-      nisus advise drive.csv --sensors "wheel_*" --out drive.yaml
+      nisus advise drive.csv --sensors "wheel_*"
     """
 
     what: Annotated[tuple[str, ...], tyro.conf.Positional]
@@ -285,7 +285,7 @@ class AdviseCommand(JsonOption, RoleOptions, TableOptions, LogOptions, Estimator
     apply: Flag = False
     """Write the lines into the twin's YAML; the previous file is kept beside it."""
     out: Path | None = None
-    """Write the changed YAML to this file. Recordings: fit the draft, check it, and write NAME.yaml and NAME.py."""
+    """Write the changed YAML to this file."""
 
 
 @dataclass(frozen=True)

@@ -132,7 +132,8 @@ def table(tmp_path):
 
 def test_a_draft_of_a_recording_runs_and_is_consistent(table, nisus):
     out = table.with_name("boiler.yaml")
-    told = nisus("advise", str(table), "--json", "--out", str(out)).json
+    told = nisus("advise", str(table), "--json").json
+    nisus("new", "boiler", "--folder", str(table.parent), "--log", str(table))
     assert {one["name"] for one in told["signals"]} == {"tank", "heater", "fan", "room", "room_again"}
     states = {item["name"]: item for item in told["states"]}
     assert set(states) == {"tank", "room"} and set(told["inputs"]) == {"heater", "fan"}
@@ -150,11 +151,12 @@ def test_the_page_of_a_recording_says_what_was_found(table, nisus):
     page = nisus("advise", str(table)).out
     assert "room_again = 0.9" in page or "room_again = 1" in page
     assert "noise, so two sensors of one state" in " ".join(page.split())
-    assert "tank: follows heater, fan" in page and "Write the draft with --out NAME.yaml" in page
+    assert "tank: follows heater, fan" in page and "nisus new NAME --log FILE writes the draft" in page
 
 
 def test_options_of_the_other_kind_are_refused(table, nisus):
-    assert "are for a twin" in nisus.refuses("advise", str(table), "--apply")
+    for option in (["--apply"], ["--out", "tank.yaml"]):
+        assert "are for a twin; nisus new NAME --log FILE" in nisus.refuses("advise", str(table), *option)
     assert "--inputs and --hold-out are for recordings" in nisus.refuses("advise", "motor_winding", "--dbc", "car.dbc")
     assert "one twin at a time" in nisus.refuses("advise", "motor_winding", "motor_can")
 
