@@ -126,7 +126,7 @@ def _topic(found: RecordingContents) -> Topic:
     sentences = [f"{len(found.holes)} gaps: {', '.join(gaps)}{more}" if gaps else "no gaps of all signals together"]
     sentences += _own_gaps(found) + _repeats(found)
     if found.kind == "table":
-        rows = tuple((series.name, *_series_cells(series, start)) for series in found.columns)
+        rows = tuple((series.name, series.unit, *_series_cells(series, start)) for series in found.columns)
         zone = f", local time of {found.time.zone}" if found.time.zone else ""
         texts = [
             f"{name}: text: " + ", ".join(f"{text} ({count:,})" for text, count in counts.most_common(MAX_TEXTS_SHOWN))
@@ -135,7 +135,9 @@ def _topic(found: RecordingContents) -> Topic:
         if found.by:
             texts.append(f"{found.by} names the source of each row; a twin reads them with landmark_column: {found.by}")
         texts += quality_conditions(found)
-        return Topic(title, (*sentences, f"time: column {found.time.label}{zone}", *texts), ("column", *TIMES), rows)
+        return Topic(
+            title, (*sentences, f"time: column {found.time.label}{zone}", *texts), ("column", "unit", *TIMES), rows
+        )
     lines: list[tuple[Cell, ...]] = []
     for message in found.messages:
         bus = "" if message.bus is None else str(message.bus)

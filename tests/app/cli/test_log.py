@@ -110,6 +110,19 @@ def test_a_table_is_listed(tmp_path, nisus, ending):
     )
 
 
+def test_units_of_a_table_are_listed(tmp_path, nisus):
+    (tmp_path / "a.csv").write_text(
+        "t,level_m,Flow [l/min],x\n" + "".join(f"{k},{k % 3},{k % 5},{k % 7}\n" for k in range(30))
+    )
+    rows = [line.split()[:4] for line in nisus("log", tmp_path / "a.csv").out.splitlines()[-4:]]
+    assert rows == [
+        ["column", "unit", "number", "rate"],
+        ["level_m", "m", "30", "1"],
+        ["Flow", "[l/min]", "l/min", "30"],
+        ["x", "30", "1", "0.0"],
+    ]
+
+
 def test_a_twin_of_a_recording_folds_as_it_stands(drive, nisus):
     given = ["--log", str(drive / "drive.blf"), "--dbc", str(drive / "car.dbc"), "--signals", "Rpm,ENGINE.Temp"]
     path = drive / "pump.yaml"
