@@ -9,6 +9,7 @@ have absolute indices; after a late measurement the events are written again fro
 
 from __future__ import annotations
 
+import io
 import json
 import math
 import os
@@ -156,7 +157,7 @@ class RecordingFile:
         data = self._bytes.read(flush_timeout_sec=FLUSH_TIMEOUT_S)
         if data:
             # Each piece is a stream of its own: the file keeps the header of the first, and no footer.
-            end = next((at for at, kind, _ in messages(data) if kind == END_MESSAGE), len(data))
+            end = next((at for at, kind, _ in messages(io.BytesIO(data), len(data)) if kind == END_MESSAGE), len(data))
             self._append(data[STREAM_HEADER if self.size else 0 : end])
 
     def close(self) -> None:
