@@ -212,8 +212,8 @@ def summary(
     `error` is {name, rmse, unit, coverage, against} of the first state with a truth, or else of a held-out sensor.
     """
     found = score(track, events, tuning.model, pictures, gate=tuning.gate, baseline=tuning.baseline)
-    nis = {name: getattr(found, name) for name in ("nis", "nis_low", "nis_high", "nis_dof")}
-    nis["nis_words"] = found.nis_verdict.words
+    nis = {name: getattr(found, name) for name in ("nis", "nis_low", "nis_high")}
+    nis |= {"nis_dof": found.nis_verdict.dof, "nis_words": found.nis_verdict.words}
     return dict(plain({"estimator": estimator} | nis | {"error": _error(found, tuning.model)}))
 
 
