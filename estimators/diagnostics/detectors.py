@@ -290,8 +290,8 @@ DETECTORS = (
     ),
     Detector(
         "dropped",
-        "{0.percent:.3g} % of the measurements were dropped, {0.counts}: too late, or with an impossible time",
-        "check the times of the source, or increase time.max_delay",
+        "{0.percent:.3g} % of the measurements were dropped, {0.counts}: too late, or with impossible times",
+        "check the times of the source, or lengthen time.max_delay",
         effect="share of measurements",
     ),
     Detector(
