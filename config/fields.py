@@ -235,7 +235,42 @@ Spread = Annotated[
 ]
 
 
-class LevelSection(Section):
+class VarianceSection(Section):
+    """A variance, or its square root."""
+
+    needs_one: ClassVar[bool] = True
+    variance: Any = None
+    std: Any = None
+
+    @model_validator(mode="after")
+    def _one(self) -> VarianceSection:
+        one_of(self, "variance", "std", required=self.needs_one)
+        return self
+
+    @property
+    def variances(self) -> tuple[float, ...] | None:
+        """The variances, one for all rows or one a row; None if none is given."""
+        if self.variance is not None:
+            return _values(self.variance)
+        return tuple(std**2 for std in _values(self.std)) if self.std is not None else None
+
+    @property
+    def bounds(self) -> tuple[float, float] | None:
+        """The least and the greatest variance, if they are given."""
+        if isinstance(self.variance, BoundedSection):
+            return self.variance.ends
+        if isinstance(self.std, BoundedSection):
+            return self.std.ends[0] ** 2, min(self.std.ends[1] ** 2, LARGEST)
+        return None
+
+
+def _values(given: float | tuple[float, ...] | BoundedSection) -> tuple[float, ...]:
+    if isinstance(given, BoundedSection):
+        return given.value
+    return given if isinstance(given, tuple) else (given,)
+
+
+class LevelSection(VarianceSection):
     """Strength of a process noise: the variance or standard deviation that one second adds. Give one of the two."""
 
     variance: Level | None = None
@@ -245,8 +280,7 @@ class LevelSection(Section):
     """Its square root: the standard deviation after one second. As `variance`."""
 
     @model_validator(mode="after")
-    def _one(self) -> LevelSection:
-        one_of(self, "variance", "std", required=True)
+    def _single(self) -> LevelSection:
         for key in ("variance", "std"):
             given = getattr(self, key)
             if isinstance(given, BoundedSection) and len(given.value) > 1:
@@ -256,14 +290,7 @@ class LevelSection(Section):
     @property
     def value(self) -> float:
         """The variance."""
-        if self.variance is not None:
-            return _values(self.variance)[0]
-        return float(_values(self.std or 0.0)[0] ** 2)
-
-    @property
-    def bounds(self) -> tuple[float, float] | None:
-        """The least and the greatest variance, if they are given."""
-        return _bounds(self.variance, self.std)
+        return (self.variances or (0.0,))[0]
 
 
 class NoiseSection(LevelSection):
@@ -275,7 +302,7 @@ class NoiseSection(LevelSection):
     `variance` a second as white noise. Default: none, white noise."""
 
 
-class ErrorSection(Section):
+class ErrorSection(VarianceSection):
     """A coloured error of a sensor, beside its white noise."""
 
     variance: Positives | None = None
@@ -285,20 +312,11 @@ class ErrorSection(Section):
     correlation_time: Duration
     """Correlation time of the error, in seconds or with a unit: 300, 5 min."""
 
-    @model_validator(mode="after")
-    def _one(self) -> ErrorSection:
-        one_of(self, "variance", "std", required=True)
-        return self
 
-    @property
-    def variances(self) -> tuple[float, ...]:
-        """The variances, one for all rows or one a row."""
-        return self.variance if self.variance is not None else tuple(std**2 for std in self.std or ())
-
-
-class SpreadSection(Section):
+class SpreadSection(VarianceSection):
     """The noise of one sensor."""
 
+    needs_one = False
     variance: Spread | None = None
     """Variance of the noise, in the square of the sensor's unit; a list gives one a row. 0 is a sensor without noise,
     which kf, ekf, iekf and the square-root filters take. {value, range} also gives the range of the data sheet,
@@ -306,35 +324,6 @@ class SpreadSection(Section):
     std: Spread | None = None
     """Its square root: standard deviation, in the sensor's unit, as {value: 0.5, range: [0.3, 0.8]}; a list gives one
     a row. As `variance`. Default: the model's."""
-
-    @model_validator(mode="after")
-    def _one(self) -> SpreadSection:
-        one_of(self, "variance", "std", required=False)
-        return self
-
-    @property
-    def variances(self) -> tuple[float, ...] | None:
-        """The variances, one for all rows or one a row; None leaves the model's."""
-        if self.variance is not None:
-            return _values(self.variance)
-        return tuple(std**2 for std in _values(self.std)) if self.std is not None else None
-
-    @property
-    def bounds(self) -> tuple[float, float] | None:
-        """The least and the greatest variance of every row, if they are given."""
-        return _bounds(self.variance, self.std)
-
-
-def _values(given: float | tuple[float, ...] | BoundedSection) -> tuple[float, ...]:
-    if isinstance(given, BoundedSection):
-        return given.value
-    return given if isinstance(given, tuple) else (given,)
-
-
-def _bounds(variance: object, std: object) -> tuple[float, float] | None:
-    if isinstance(variance, BoundedSection):
-        return variance.ends
-    return (std.ends[0] ** 2, min(std.ends[1] ** 2, LARGEST)) if isinstance(std, BoundedSection) else None
 
 
 def _ordered(pair: Pair) -> Pair:

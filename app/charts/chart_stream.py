@@ -18,16 +18,13 @@ from estimators.errors import ConfigError
 
 from ..columns import DOTS, LOWER, UPPER, Column
 from .charted_run import ChartedRun
-from .levels_of_detail import FACTOR, FIRST, Groups
+from .levels_of_detail import FACTOR, FIRST, NEVER, Groups
 
 MAX_DOT_ROWS = 20_000
 """Rows up to which every dot is drawn; of more, a random sample of as many and the extremes of each group."""
 
 SLACK = 1.3
 """Factor by which the number of groups may leave its bounds before their size changes: charts would flicker."""
-
-LAST_ROW = 2**62
-"""After every row."""
 
 Seconds = Annotated[float, Field(gt=-1e9, lt=1e9)]
 
@@ -74,7 +71,7 @@ class ChartStream:
         """Groups that the browser has, from the first to before the second; the row after their last."""
         self._sent_as: object = None
         """Run, generation, group size and choice of dots of those."""
-        self._dirty = LAST_ROW
+        self._dirty = NEVER
         """First row that has changed since the last frame."""
         self._offsets = np.full(len(query.columns), np.nan)
 
@@ -121,7 +118,7 @@ class ChartStream:
             return None
         groups = run.groups(size, at, last, list(self.query.columns))
         samples = self._samples(run, groups)
-        self._sent_as, self._dirty, self._end = sent_as, LAST_ROW, end
+        self._sent_as, self._dirty, self._end = sent_as, NEVER, end
         # The last group may grow.
         self._sent = (first, groups.start + groups.n)
         return self._packed(groups, samples, origin, fresh, first, run.revision)

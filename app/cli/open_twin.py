@@ -82,8 +82,7 @@ def recorded_twin(recorded: ReadRecording) -> Twin:
     from ..engine.fold_json import tuning_from_json
 
     twin = restore_twin(recorded.text, recorded.twin_path, recorded.overrides, recorded.version)
-    tuning, estimator = tuning_from_json(recorded.tuning, twin.model)
-    tuning = replace(tuning, baseline=twin.tuning.baseline)
+    tuning, estimator = tuning_from_json(recorded.tuning, twin.model, twin.tuning.baseline)
     return replace(twin, tuning=tuning, estimator=estimator, recorded=True)
 
 

@@ -1,13 +1,15 @@
-"""Forecasts of a running twin: parse the question, fold on from the present state, return the answer as JSON."""
+"""Forecasts of a running twin: fold on from the present state, return the answer as JSON."""
 
 from __future__ import annotations
 
 import math
 import time
 from collections.abc import Container, Mapping, Sequence
-from typing import NamedTuple
+from dataclasses import dataclass, field
+from typing import Annotated, Literal
 
 import numpy as np
+from pydantic import Field, FiniteFloat
 
 from estimators.diagnostics.references import HALF_WIDTH
 from estimators.errors import LARGEST, ConfigError
@@ -24,39 +26,45 @@ MAX_CHANGES = 200  # changes of one input
 MAX_COMPUTING_S = 8.0  # seconds that a forecast may take to compute
 DEFAULT_STEP_S = 1.0  # step after a single measurement
 SHARES = (0.1, 0.5, 0.9)  # probabilities of crossing a limit whose times are returned
+REPEAT = "repeat"  # in place of an input's values: those that it had before
+
+Changes = Annotated[list[tuple[FiniteFloat, FiniteFloat]], Field(min_length=1, max_length=MAX_CHANGES)]
+"""Changes of one input: seconds from now, and the value from then on."""
 
 
-class ForecastQuestion(NamedTuple):
+@dataclass(frozen=True)
+class ForecastQuestion:
     """Horizon (s), changes by input, and limits by state in its unit.
 
-    The inputs in `repeated` repeat their values of the last seconds, as long as the horizon.
+    An input has one value from now on, pairs of seconds from now and the value from then on, or `REPEAT`: it repeats
+    its values of the last seconds, as long as the horizon.
     """
 
-    horizon: float
-    inputs: dict[str, Changes]
-    limits: dict[str, float]
-    repeated: tuple[str, ...] = ()
+    horizon: Annotated[FiniteFloat, Field(gt=0.0, lt=1e9)]
+    inputs: dict[str, FiniteFloat | Literal["repeat"] | Changes] = field(default_factory=dict)
+    limits: dict[str, FiniteFloat] = field(default_factory=dict)
 
+    def check(self, model: StateSpaceModel) -> None:
+        """Check names and times.
 
-def question_from_json(body: object, model: StateSpaceModel) -> ForecastQuestion:
-    """Parse `{"horizon": s, "inputs": {name: value | [[t, value], ...] | "repeat"}, "limits": {state: value}}`.
-
-    Raises:
-        ConfigError: If it is not that.
-    """
-    if not isinstance(body, dict) or not set(body) <= {"horizon", "inputs", "limits"}:
-        raise ConfigError("forecast: it takes horizon, inputs and limits")
-    horizon = _number("horizon", body.get("horizon"))
-    if not horizon > 0.0:
-        raise ConfigError(f"forecast: horizon is {horizon:g} s; it must be positive")
-    given = _named("inputs", body.get("inputs", {}), model.input_names)
-    repeated = tuple(name for name, value in given.items() if value == REPEAT)
-    inputs = {name: _changes(f"inputs.{name}", value, horizon) for name, value in given.items() if name not in repeated}
-    shown = [state.name for state in model.shown_states]
-    limits = _named("limits", body.get("limits", {}), shown)
-    return ForecastQuestion(
-        horizon, inputs, {name: _number(f"limits.{name}", value) for name, value in limits.items()}, repeated
-    )
+        Raises:
+            ConfigError: If the model has no such input or state, or an input changes after the horizon.
+        """
+        shown = [state.name for state in model.shown_states]
+        for where, asked, names in (
+            ("inputs", list(self.inputs), model.input_names),
+            ("limits", list(self.limits), shown),
+        ):
+            unknown = next((name for name in asked if name not in names), None)
+            if unknown is not None:
+                raise ConfigError(f"forecast: {where} names {unknown!r}; there are {', '.join(names) or 'none'}")
+        for name, changes in self.inputs.items():
+            times = [t for t, _ in changes] if isinstance(changes, list) else []
+            late = next((t for t in times if not 0.0 <= t <= self.horizon), None)
+            if late is not None:
+                raise ConfigError(
+                    f"forecast: inputs.{name} changes at {late:g} s; it must be between 0 and the horizon"
+                )
 
 
 class Forecasts:
@@ -87,9 +95,15 @@ class Forecasts:
             NisusError: If nothing has come yet, the question is too large, or `forecast` refuses it.
         """
         begun = time.monotonic()
+        question.check(self._engine.model)
         here = self._here()
         step = _step(here, question.horizon, self._engine.model.max_step)
-        inputs = question.inputs | recorded(self._engine, question.repeated, here.t, question.horizon)
+        repeated = [name for name, given in question.inputs.items() if given == REPEAT]
+        inputs = {
+            name: given if isinstance(given, list) else [(0.0, given)]
+            for name, given in question.inputs.items()
+            if not isinstance(given, str)
+        } | recorded(self._engine, repeated, here.t, question.horizon)
 
         def between() -> None:
             if time.monotonic() - begun > MAX_COMPUTING_S:
@@ -203,35 +217,6 @@ def _step(here: Here, horizon: float, longest: float) -> float:
     return step
 
 
-def _named(where: str, given: object, names: Sequence[str]) -> JsonObject:
-    if not isinstance(given, dict):
-        raise ConfigError(f"forecast: {where} is {given!r}; it must be an object of names and values")
-    unknown = next((name for name in given if name not in names), None)
-    if unknown is not None:
-        raise ConfigError(f"forecast: {where} names {unknown!r}; there are {', '.join(names) or 'none'}")
-    return given
-
-
-def _changes(where: str, given: object, horizon: float) -> list[tuple[float, float]]:
-    if not isinstance(given, list):
-        return [(0.0, _number(where, given))]
-    if not 0 < len(given) <= MAX_CHANGES or not all(isinstance(pair, list) and len(pair) == 2 for pair in given):
-        raise ConfigError(f"forecast: {where} must be a number, or at most {MAX_CHANGES} pairs [seconds, value]")
-    pairs = [(_number(where, seconds), _number(where, value)) for seconds, value in given]
-    late = next((seconds for seconds, _ in pairs if not 0.0 <= seconds <= horizon), None)
-    if late is not None:
-        raise ConfigError(f"forecast: {where} changes at {late:g} s; it must be between 0 and the horizon")
-    return pairs
-
-
-def _number(where: str, value: object) -> float:
-    if isinstance(value, bool) or not isinstance(value, (int, float)) or not abs(value) <= LARGEST:
-        raise ConfigError(f"forecast: {where} is {value!r}; it must be a finite number")
-    return float(value)
-
-
-REPEAT = "repeat"  # in place of an input's values: those that it had before
-Changes = list[tuple[float, float]]  # changes of one input: seconds from now, and the value from then on
 MAX_STEPS = 20_000  # steps of a forecast; each is as long as the time between measurements
 MAX_TIMES = 160  # times in the answer
 

@@ -39,12 +39,6 @@ class RunScore:
     seconds: float
     step_us: float = np.nan
 
-    @property
-    def log_likelihood_reading(self) -> float:
-        """Log-likelihood of a measurement, used or rejected, which compares runs of different length."""
-        judged = self.score.nis_readings + self.score.gated
-        return self.score.log_likelihood / judged if judged else np.nan
-
 
 class RunScores:
     """Scores of all revisions of a twin, each computed once; that of the running one again as it grows.

@@ -25,8 +25,8 @@ def tuning_to_json(tuning: Tuning, estimator: str) -> str:
     return json.dumps({"estimator": estimator, **arrays, **plain, "options": dict(tuning.options), **members})
 
 
-def tuning_from_json(text: str, model: StateSpaceModel) -> tuple[Tuning, str]:
-    """Return the tuning and the estimator that `tuning_to_json` wrote."""
+def tuning_from_json(text: str, model: StateSpaceModel, baseline: np.ndarray | None = None) -> tuple[Tuning, str]:
+    """Return the tuning, with the baseline of the twin's file, and the estimator that `tuning_to_json` wrote."""
     values = json.loads(text)
     # In older recordings and stores an ensemble had 50 members by default.
     former = {"members": 50.0} if "members" not in values and values["estimator"] in ENSEMBLES else {}
@@ -43,6 +43,7 @@ def tuning_from_json(text: str, model: StateSpaceModel) -> tuple[Tuning, str]:
         options=former | values["options"],
         seed=values["seed"],
         name=values.get("name", ""),
+        baseline=baseline,
     )
     return tuning, values["estimator"]
 

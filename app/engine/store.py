@@ -369,8 +369,7 @@ def _stored_twin(
     base = base_from_json(json.dumps(parts["base"]))
     events = Events.concat([item for _, item in rows], twin.model.width)
     events = events.select(slice(state["oldest"] - rows[0][0] if rows else 0, None))
-    tuning, estimator = tuning_from_json(json.dumps(parts["tuning"]), before.model)
-    tuning = replace(tuning, baseline=before.tuning.baseline)
+    tuning, estimator = tuning_from_json(json.dumps(parts["tuning"]), before.model, before.tuning.baseline)
     estimator, tuning = merged(before, twin, estimator, tuning)
     if base is not None:
         check_base(base, twin.model)
@@ -428,8 +427,7 @@ def _run_to_json(run: Revision) -> JsonObject:
 
 
 def _run_from_json(values: JsonObject, twin: Twin) -> Revision:
-    tuning, estimator = tuning_from_json(values["settings"], twin.model)
-    tuning = replace(tuning, baseline=twin.tuning.baseline)
+    tuning, estimator = tuning_from_json(values["settings"], twin.model, twin.tuning.baseline)
     return Revision(estimator=estimator, tuning=tuning, **{name: values[name] for name in _RUN_FIELDS})
 
 

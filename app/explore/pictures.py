@@ -212,6 +212,11 @@ def _lines(lines: list[np.ndarray], color: tuple[int, int, int], width: float) -
     return rr.LineStrips2D.columns(strips=strips(lines), colors=[color] * len(lines), radii=radii)
 
 
+def _dots(places: np.ndarray, color: tuple[int, int, int], radius: float, **more: object) -> rr.ComponentColumnList:
+    radii = np.full(len(places), radius, np.float32)
+    return rr.Points2D.columns(positions=places.astype(np.float32), colors=[color] * len(places), radii=radii, **more)
+
+
 def axis_scales(model: StateSpaceModel, pair: np.ndarray) -> np.ndarray:
     """Return the scale of each axis: 1 if the units agree, or the order of magnitude of the priors' deviations.
 
@@ -281,21 +286,15 @@ class PairDrawing:
         var = (track.std[:, self._columns] / self._scale) ** 2
         cross = track.cross[:, self._index] / self._scale.prod()
         points = ellipse_points(mean, var, cross).astype(np.float32)
-        count = np.full(t.size, 1)
-        sink.columns(f"{self._path}/ellipse", t, _lines(list(points), self._palette.estimate, 1.0).partition(count))
-        dots = rr.Points2D.columns(
-            positions=mean.astype(np.float32),
-            colors=[self._palette.estimate] * t.size,
-            radii=np.full(t.size, -3.0, np.float32),
-        )
-        sink.columns(f"{self._path}/mean", t, dots.partition(count))
-        way = self._trail(sink, t, mean.astype(np.float32), past)
-        numbers = rr.Points2D.columns(
-            positions=anchors(mean, points, way).astype(np.float32), colors=[self._palette.estimate] * t.size,
-            labels=self._labels(track), radii=np.full(t.size, -0.01, np.float32),
-        )  # fmt: skip
-        sink.columns(f"{self._path}/numbers", t, numbers.partition(count))
-        sink.columns(f"{self._path}/way", t, _lines(way, self._palette.previous, 0.5).partition(count))
+        color, way = self._palette.estimate, self._trail(sink, t, mean.astype(np.float32), past)
+        self._each(sink, "ellipse", t, _lines(list(points), color, 1.0))
+        self._each(sink, "mean", t, _dots(mean, color, -3.0))
+        self._each(sink, "numbers", t, _dots(anchors(mean, points, way), color, -0.01, labels=self._labels(track)))
+        self._each(sink, "way", t, _lines(way, self._palette.previous, 0.5))
+
+    def _each(self, sink: Sink, name: str, t: np.ndarray, what: rr.ComponentColumnList) -> None:
+        """Log one picture for each time."""
+        sink.columns(f"{self._path}/{name}", t, what.partition(np.full(t.size, 1)))
 
     def _labels(self, track: Track) -> list[str]:
         units = [self._model.states[j].unit.replace("1", "") for j in self._pair]
@@ -329,8 +328,4 @@ class PairDrawing:
             return
         near = np.unique(np.clip(np.searchsorted(times, wanted), 0, times.size - 1))
         values = np.stack((a[of_a], b[of_b]), axis=1)[near] / self._scale
-        dots = rr.Points2D.columns(
-            positions=values.astype(np.float32), colors=[self._palette.truth] * near.size,
-            radii=np.full(near.size, -4.0, np.float32),
-        )  # fmt: skip
-        sink.columns(f"{self._path}/truth", times[near], dots.partition(np.full(near.size, 1)))
+        self._each(sink, "truth", times[near], _dots(values, self._palette.truth, -4.0))

@@ -9,6 +9,7 @@ have absolute indices; after a late measurement the events are written again fro
 
 from __future__ import annotations
 
+import io
 import json
 import math
 import os
@@ -156,7 +157,7 @@ class RecordingFile:
         data = self._bytes.read(flush_timeout_sec=FLUSH_TIMEOUT_S)
         if data:
             # Each piece is a stream of its own: the file keeps the header of the first, and no footer.
-            end = next((at for at, kind, _ in messages(data) if kind == END_MESSAGE), len(data))
+            end = next((at for at, kind, _ in messages(io.BytesIO(data), len(data)) if kind == END_MESSAGE), len(data))
             self._append(data[STREAM_HEADER if self.size else 0 : end])
 
     def close(self) -> None:
@@ -211,8 +212,8 @@ def summary(
     `error` is {name, rmse, unit, coverage, against} of the first state with a truth, or else of a held-out sensor.
     """
     found = score(track, events, tuning.model, pictures, gate=tuning.gate, baseline=tuning.baseline)
-    nis = {name: getattr(found, name) for name in ("nis", "nis_low", "nis_high", "nis_dof")}
-    nis["nis_words"] = found.nis_verdict.words
+    nis = {name: getattr(found, name) for name in ("nis", "nis_low", "nis_high")}
+    nis |= {"nis_dof": found.nis_verdict.dof, "nis_words": found.nis_verdict.words}
     return dict(plain({"estimator": estimator} | nis | {"error": _error(found, tuning.model)}))
 
 

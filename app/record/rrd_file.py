@@ -40,13 +40,14 @@ TIMES = {"s": 1.0, "min": 60.0, "h": 3600.0, "d": 86400.0}
 MIN_PART_BYTES, MIN_PART_S = 10**5, 1.0  # Size and duration below which a part would hold little but its header
 
 
-def messages(data: bytes) -> Iterator[tuple[int, int, int]]:
-    """Yield start, kind and end of each complete message in the bytes of an .rrd."""
+def messages(file: BinaryIO, size: int) -> Iterator[tuple[int, int, int]]:
+    """Yield start, kind and end of each complete message in an .rrd of `size` bytes."""
     at = STREAM_HEADER
-    while at + MESSAGE_HEADER.size <= len(data):
-        kind, length = MESSAGE_HEADER.unpack_from(data, at)
+    while at + MESSAGE_HEADER.size <= size:
+        file.seek(at)
+        kind, length = MESSAGE_HEADER.unpack(file.read(MESSAGE_HEADER.size))
         end = at + MESSAGE_HEADER.size + length
-        if end > len(data):
+        if end > size:
             return
         yield at, kind, end
         at = end
@@ -54,14 +55,12 @@ def messages(data: bytes) -> Iterator[tuple[int, int, int]]:
 
 def complete_until(file: BinaryIO, size: int) -> tuple[int, bool]:
     """Return the end of the last complete message in a file of `size` bytes, and whether it closes the file."""
-    end, kind = STREAM_HEADER, -1
-    while kind != END_MESSAGE and end + MESSAGE_HEADER.size <= size:
-        file.seek(end)
-        kind_here, length = MESSAGE_HEADER.unpack(file.read(MESSAGE_HEADER.size))
-        if end + MESSAGE_HEADER.size + length > size:
+    end, closed = STREAM_HEADER, False
+    for _, kind, after in messages(file, size):
+        end, closed = after, kind == END_MESSAGE
+        if closed:
             break
-        kind, end = kind_here, end + MESSAGE_HEADER.size + length
-    return min(end, size), kind == END_MESSAGE
+    return min(end, size), closed
 
 
 class Disk:

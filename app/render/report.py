@@ -118,9 +118,8 @@ def _scores(run: Reported, found: Score) -> Topic:
         rows.append((title, f"{digits(fit.rmse)} {unit}".rstrip(), f"{100 * fit.coverage:.3g} % in the 95 % band"))
     if found.field is not None:
         rows.append(("RMSE of all cells", digits(found.field.rmse), f"{100 * found.field.coverage:.3g} % in the band"))
-    judged = found.nis_readings + found.gated
-    each = found.log_likelihood / judged if judged else np.nan
-    rows.append(("log-likelihood", f"{found.log_likelihood:.6g}", f"{digits(each)} per measurement"))
+    each = f"{digits(found.log_likelihood_reading)} per measurement"
+    rows.append(("log-likelihood", f"{found.log_likelihood:.6g}", each))
     counts = np.bincount(track.verdict[run.events.kind == READING], minlength=len(VERDICT_NAMES))
     verdicts = [
         f"{name} {count:,}" for name, count in zip(VERDICT_NAMES[1:], counts[1:].tolist(), strict=True) if count

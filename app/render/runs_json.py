@@ -45,8 +45,9 @@ def _score(known: RunScore, units: dict[str, str]) -> JsonObject:
     fits += [(name, "held out", fit) for name, fit in score.held_out.items()]
     if score.field is not None:
         fits.append(("all cells", "truth", score.field))
-    found = {name: getattr(known, name) for name in ("rows", "seconds", "log_likelihood_reading", "step_us")}
-    found |= {name: getattr(score, name) for name in ("log_likelihood", "readings", "refused")}
+    found = {name: getattr(known, name) for name in ("rows", "seconds", "step_us")}
+    names = ("log_likelihood_reading", "log_likelihood", "readings", "refused")
+    found |= {name: getattr(score, name) for name in names}
     found |= nis_json(score.nis_verdict)
     found["fits"] = [
         {"name": name, "against": against, "unit": units.get(name, "")} | fit._asdict() for name, against, fit in fits

@@ -5,7 +5,6 @@ from __future__ import annotations
 import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import replace
-from typing import NamedTuple
 
 import numpy as np
 
@@ -25,21 +24,6 @@ from .scores import FilterScore, Spread, pictures_of
 SEEDS = 8  # folds of a filter that draws random members; others are folded once
 BUDGET_S = 20.0  # default processor seconds for the folds of one filter
 MIN_TIMED_S = 0.2  # processor seconds for which a fold is timed
-
-
-class Outcome(NamedTuple):
-    """Scores of one fold; see `FilterScore`."""
-
-    rmse: dict[str, float]
-    nis: float
-    nis_bounds: tuple[float, float]
-    coverage: float
-    seconds_per_step: float
-    since: float
-    lost: float
-    refused: float
-    nis_dof: float = 1.0
-    nis_judged: float = np.nan
 
 
 def draws(entry: Estimator) -> bool:
@@ -65,7 +49,7 @@ def fold_row(
     options = dict(twin.options_of(estimator))
     folds = max(len(logs), SEEDS if draws(entry) else 1)
     share = np.inf if estimator == twin.estimator else budget / folds
-    outcomes: list[Outcome] = []
+    outcomes: list[FilterScore] = []
     span = None
     try:
         for k in range(folds):
@@ -80,7 +64,7 @@ def fold_row(
     except NisusError as error:
         nothing = Spread(np.nan)
         return FilterScore(estimator, {}, nothing, (np.nan, np.nan), nothing, np.nan, options, failure=str(error))
-    return row_of(estimator, outcomes, options, span)
+    return mean_of(outcomes, span)
 
 
 def able(twin: Twin, estimator: str) -> Twin:
@@ -136,8 +120,8 @@ def fold_within(fold: Fold, budget: float, enough: float = 0.0, check: Callable[
     return min(took) / max(1, fold.n)
 
 
-def outcome_of(fold: Fold, events: Events, seconds: float, scored: tuple[int, int] | None = None) -> Outcome:
-    """Return the scores of a fold over its first events, or over those between two times, ns.
+def outcome_of(fold: Fold, events: Events, seconds: float, scored: tuple[int, int] | None = None) -> FilterScore:
+    """Return the scores of one fold over its first events, or over those between two times, ns.
 
     Raises:
         NisusError: If it ended before them.
@@ -161,41 +145,44 @@ def outcome_of(fold: Fold, events: Events, seconds: float, scored: tuple[int, in
     mode = model.jump.state if model.jump else None
     covered = [fit.coverage for name, fit in fits.items() if name != mode]
     lost = np.flatnonzero(track.health == DIVERGED)
-    return Outcome(
-        rmse={unit: float(np.sqrt(np.mean([fit.rmse**2 for fit in group]))) for unit, group in groups.items()},
-        nis=result.nis,
+    return FilterScore(
+        fold.estimator.name,
+        rmse={unit: Spread(float(np.sqrt(np.mean([fit.rmse**2 for fit in group])))) for unit, group in groups.items()},
+        nis=Spread(result.nis),
         nis_bounds=(result.nis_low, result.nis_high),
-        coverage=float(np.mean(covered)) if covered else np.nan,
+        coverage=Spread(float(np.mean(covered)) if covered else np.nan),
         seconds_per_step=seconds,
+        options=dict(fold.tuning.options),
+        diverged=int(lost.size > 0),
         since=float((events.t[lost[0]] - events.t[0]) * 1e-9) if lost.size else np.nan,
         lost=lost.size / len(track),
         refused=result.refused if result.gated else 0.0,
-        nis_dof=result.nis_dof,
+        nis_dof=result.nis_verdict.dof,
         nis_judged=result.nis_verdict.measure,
     )
 
 
-def row_of(
-    estimator: str, outcomes: Sequence[Outcome], options: Mapping[str, float], span: float | None
-) -> FilterScore:
-    """Outcomes of several seeds or logs as one row."""
-    since = [outcome.since for outcome in outcomes if np.isfinite(outcome.since)]
-    return FilterScore(
-        estimator=estimator,
+def mean_of(outcomes: Sequence[FilterScore], span: float | None) -> FilterScore:
+    """Return the scores of several seeds or logs as one row."""
+
+    def mean(name: str) -> float:
+        return float(np.mean([getattr(outcome, name) for outcome in outcomes]))
+
+    return replace(
+        outcomes[0],
         rmse={unit: _spread([outcome.rmse[unit] for outcome in outcomes]) for unit in outcomes[0].rmse},
         nis=_spread([outcome.nis for outcome in outcomes]),
         nis_bounds=tuple(np.mean([outcome.nis_bounds for outcome in outcomes], axis=0).tolist()),  # type: ignore[arg-type]
         coverage=_spread([outcome.coverage for outcome in outcomes]),
         seconds_per_step=min(outcome.seconds_per_step for outcome in outcomes),
-        options=options,
-        nis_dof=float(np.mean([outcome.nis_dof for outcome in outcomes])),
-        nis_judged=float(np.mean([outcome.nis_judged for outcome in outcomes])),
+        nis_dof=mean("nis_dof"),
+        nis_judged=mean("nis_judged"),
         seeds=len(outcomes),
         span=span,
-        diverged=len(since),
-        since=min(since, default=np.nan),
-        lost=float(np.mean([outcome.lost for outcome in outcomes])),
-        refused=float(np.mean([outcome.refused for outcome in outcomes])),
+        diverged=sum(outcome.diverged for outcome in outcomes),
+        since=min((outcome.since for outcome in outcomes if outcome.diverged), default=np.nan),
+        lost=mean("lost"),
+        refused=mean("refused"),
     )
 
 
@@ -210,7 +197,8 @@ def best_text(rows: Sequence[FilterScore]) -> str:
     return f"best so far {name}, RMSE {errors[name]:.3g} {unit}".rstrip()
 
 
-def _spread(values: Sequence[float]) -> Spread:
+def _spread(figures: Sequence[Spread]) -> Spread:
+    values = [figure.value for figure in figures]
     return Spread(float(np.mean(values)), float(np.std(values, ddof=1)) if len(values) > 1 else np.nan)
 
 

@@ -231,7 +231,7 @@ def explained(fold: Fold, listed: Sequence[Episode]) -> list[ExplainedEpisode]:
 def fold_json(result: FoldResult) -> JsonObject:
     """Return a fold for scripts; docs/reference.md describes its fields."""
     twin, fold, scored, counts = result.twin, result.fold, result.scored, result.counts
-    smoothing = result.smoothing
+    smoothing, verdict = result.smoothing, scored.nis_verdict
     cov = fold.moments()[1] if fold.model.considered else None
     found = {
         "twin": twin.name,
@@ -249,14 +249,14 @@ def fold_json(result: FoldResult) -> JsonObject:
             for name, fit in scored.held_out.items()
         },
         "nis": {
-            "mean": scored.nis,
-            "low": scored.nis_low,
-            "high": scored.nis_high,
+            "mean": verdict.nis,
+            "low": verdict.low,
+            "high": verdict.high,
             "n": scored.nis_readings,
-            "dof": scored.nis_dof,
-            "place": scored.nis_verdict.place,
-            "white_low": scored.nis_white[0],
-            "white_high": scored.nis_white[1],
+            "dof": verdict.dof,
+            "place": verdict.place,
+            "white_low": verdict.white_low,
+            "white_high": verdict.white_high,
         },
         "log_likelihood": scored.log_likelihood,
         "log_likelihood_used": scored.log_likelihood_used,

@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Collection, Iterable, Sequence
 from typing import Any
 
+from config.fields import VarianceSection
 from config.loader import Loaded
 from config.schema import PriorSection, SensorSection
 from config.yaml_files import Key
@@ -12,7 +13,7 @@ from estimators.diagnostics.detectors import ALARM_NAMES, CAUSES
 from estimators.diagnostics.episodes.baseline import Normal
 from estimators.errors import ConfigError, nearest
 from estimators.fit.entries import check_key
-from estimators.model.state_space import StateSpaceModel
+from estimators.model.state_space import Sensor, StateSpaceModel
 from estimators.tuning import Tuning
 
 
@@ -75,12 +76,14 @@ def check_stated(loaded: Loaded, model: StateSpaceModel, source: str) -> None:
         raise loaded.error(("noise",), f"is missing, and {source} has none; give for example {example}: {{std}}")
 
 
-def one_each(loaded: Loaded, key: Key, values: tuple, rows: list[str]) -> tuple:
-    """Return a value for each row, from one for all or one each."""
+def row_variances(loaded: Loaded, key: Key, section: VarianceSection, sensor: Sensor) -> tuple[float, ...]:
+    """Return the variance of each row of a sensor, from one for all or one each; none if the section gives none."""
+    values, rows = section.variances or (), [row.name for row in sensor.rows]
     if len(values) == 1:
         return values * len(rows)
-    if len(values) != len(rows):
-        raise loaded.error(key, f"has {len(values)} entries; give one, or {len(rows)}: {', '.join(rows)}")
+    if values and len(values) != len(rows):
+        place = (*key, "std" if section.std is not None else "variance")
+        raise loaded.error(place, f"has {len(values)} entries; give one, or {len(rows)}: {', '.join(rows)}")
     return values
 
 

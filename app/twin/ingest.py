@@ -5,10 +5,12 @@ from __future__ import annotations
 import math
 from collections import deque
 from collections.abc import Callable, Iterator, Sequence
+from types import SimpleNamespace
 from typing import NamedTuple
 
 import numpy as np
 
+from estimators.diagnostics.detectors import detector_of
 from estimators.diagnostics.episodes import Episode
 from estimators.errors import spaced
 from estimators.events.arrays import blank
@@ -206,10 +208,7 @@ class Ingest:
 
 def dropped_episode(start: float, lost: int, taken: int) -> Episode:
     """Return the episode of so many lost measurements of all that were taken since `start`, s."""
-    text = (
-        f"{100 * lost / taken:.3g} % of the measurements were dropped, {lost} of {taken}: too late, or with impossible "
-        "times; check the times of the source, or lengthen time.max_delay"
-    )
+    text = detector_of("dropped").text(SimpleNamespace(percent=100 * lost / taken, counts=f"{lost} of {taken}"))
     return Episode(start, None, "twin", "dropped", lost / taken, math.nan, math.nan, "", text)
 
 

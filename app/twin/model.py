@@ -30,7 +30,7 @@ from estimators.model.user_file import imported_beside, run_file
 from estimators.models import MODELS
 from estimators.plausibility import DAY, surprise
 
-from .checks import check_named, check_names, estimated_names, one_each
+from .checks import check_named, check_names, estimated_names, row_variances
 from .defaults import instrument_sections, parameter_sections
 from .landmarks import expanded
 from .matrices import matrices_model
@@ -181,9 +181,9 @@ def _assembled(model: StateSpaceModel, loaded: Loaded) -> StateSpaceModel:
     check_names(loaded, ("sensors",), given, model.sensor_names, "sensor", model)
     errors = {}
     for name, error in given.items():
-        rows = [row.name for row in model.sensors[model.sensor_names.index(name)].rows]
-        key = ("sensors", name, "error", "std" if error.std is not None else "variance")
-        errors[name] = ColouredError(one_each(loaded, key, error.variances, rows), error.correlation_time)
+        sensor = model.sensors[model.sensor_names.index(name)]
+        variances = row_variances(loaded, ("sensors", name, "error"), error, sensor)
+        errors[name] = ColouredError(variances, error.correlation_time)
     instruments = _instruments(model, loaded)
     sections = parameter_sections(model, config)
     values = {item.name: item.value for item in model.parameters}
@@ -404,9 +404,7 @@ def _sensor(sensor: Sensor, loaded: Loaded) -> Sensor:
     section = loaded.config.sensors.get(sensor.name, SensorSection())
     if section.correlation is not None:
         sensor = replace(sensor, correlation=_correlation(sensor, section.correlation, loaded))
-    if section.variances is not None:
-        key = ("sensors", sensor.name, "std" if section.std is not None else "variance")
-        variances = one_each(loaded, key, section.variances, [row.name for row in sensor.rows])
+    if variances := row_variances(loaded, ("sensors", sensor.name), section, sensor):
         rows = tuple(replace(row, variance=variance) for row, variance in zip(sensor.rows, variances, strict=True))
         sensor = replace(sensor, rows=rows)
     by_chance = section.expected == "by chance" or sensor.by_chance and "expected" not in section.model_fields_set

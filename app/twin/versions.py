@@ -105,11 +105,10 @@ def figures(found: Score) -> dict[str, float]:
         truth is known and each sensor row held out `rmse.NAME` in its unit and `coverage.NAME` as a share; `rmse.field`
         for all cells of a large field.
     """
-    judged = found.nis_readings + found.gated
     fits = {**found.states, **found.held_out, **({"field": found.field} if found.field is not None else {})}
     known = {
-        NIS: found.nis / found.nis_dof,
-        LIKELIHOOD: found.log_likelihood / judged if judged else np.nan,
+        NIS: found.nis_verdict.ratio,
+        LIKELIHOOD: found.log_likelihood_reading,
         REFUSED: found.refused,
         **_fits(fits, "rmse"),
     }

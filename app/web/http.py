@@ -48,8 +48,9 @@ QUEUE_TIMEOUT_S = 15.0
 RULES = {
     "float_type": "a number", "float_parsing": "a number", "int_type": "a whole number",
     "int_parsing": "a whole number", "bool_type": "true or false", "bool_parsing": "true or false",
-    "string_type": "a text", "list_type": "a list of texts",
+    "string_type": "a text", "list_type": "a list of pairs",
     "tuple_type": "a list of texts", "dict_type": "an object of numbers", "none_required": "null",
+    "too_short": "longer", "missing": "longer", "too_long": "shorter",
 }  # fmt: skip
 """Types of pydantic's errors in words."""
 

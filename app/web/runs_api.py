@@ -220,7 +220,7 @@ def _scored(scores: RunScores) -> tuple[tuple[str, ...], ...]:
         if known is not None:
             fits = [*{**known.score.states, **known.score.held_out}.items()][:MAX_ERRORS]
             errors = ", ".join(f"{subject} {digits(fit.rmse)}" for subject, fit in fits)
-            line = digits(known.score.nis_verdict.ratio), f"{known.log_likelihood_reading:.4g}", errors
+            line = digits(known.score.nis_verdict.ratio), f"{known.score.log_likelihood_reading:.4g}", errors
         lines.append((f"{run.number} {run.name}".rstrip(), what_changed(run, there), *line))
     return tuple(lines)
 

@@ -27,7 +27,7 @@ from estimators.errors import ConfigError, EstimatorError, NisusError, reason_of
 from ..charts.colors import EITHER, THEMES
 from ..charts.series import Series
 from ..derive.diagnosis import Diagnosis
-from ..derive.forecast import Forecasts, question_from_json
+from ..derive.forecast import ForecastQuestion, Forecasts
 from ..derive.refits import Refits
 from ..engine.engine import STATUS_PERIOD_S, Engine
 from ..engine.faults import catalogue_json
@@ -275,9 +275,9 @@ class PageServer:
         self._engine.submit(command)
         return {"submitted": type(command).__name__}
 
-    def _forecast(self, body: object) -> JsonObject:
+    def _forecast(self, question: ForecastQuestion) -> JsonObject:
         """Forecast from the present estimate."""
-        return self._forecasts.compute(question_from_json(body, self._engine.model))
+        return self._forecasts.compute(question)
 
     def _scene(self) -> Response | list[JsonObject]:
         """Return the options of the scene."""

@@ -75,7 +75,6 @@ class Detector(NamedTuple):
         name: The cause, as episodes, JSON and the guide name it.
         wording: Text of an episode, formatted with the facts of one (`episodes/wording.py`) as field 0.
         remedy: What to do, formatted alike; follows the wording.
-        statistic: The tested statistic, for the guide.
         effect: Quantity of an episode's size; "" where only the tests themselves are known.
         unit: Unit of the size.
         alarms: Tests by the name of their alarm, a bit of `Track.alarms`. Alarms without tests have a kernel of their
@@ -89,7 +88,6 @@ class Detector(NamedTuple):
     name: str
     wording: str = "{0.name}: {0.cause} innovations {0.since} (log-likelihood ratio {0.size:.2g} nats a measurement)"
     remedy: str = "see the guide"
-    statistic: str = ""
     effect: str = ""
     unit: str = ""
     alarms: Mapping[str, tuple[Ratio | Density, ...]] = MappingProxyType({})
@@ -143,7 +141,6 @@ DETECTORS = (
         "narrow",
         "bands of {0.name} are too narrow {0.since}: innovations are {0.size:.2f} times as large as predicted",
         "increase {0.variance}, or check the sensor for added noise",
-        statistic="variance of e, tested at 1.5, 2.5 and 6",
         effect="ratio of the standard deviation to the predicted one",
         unit="×",
         alarms={"narrow": (scale_ratio(1.5), scale_ratio(2.5), scale_ratio(6.0))},
@@ -152,7 +149,6 @@ DETECTORS = (
         "wide",
         "bands of {0.name} are too wide {0.since}: innovations are {0.size:.2f} times as large as predicted",
         "reduce {0.variance}",
-        statistic="variance of e, tested at 0.6, 0.3 and 0.05",
         effect="ratio of the standard deviation to the predicted one",
         unit="×",
         alarms={"wide": (scale_ratio(0.6), scale_ratio(0.3), scale_ratio(0.05))},
@@ -162,7 +158,6 @@ DETECTORS = (
         "shifted",
         "{0.name} reads {0.offset} ({0.sigmas:.1f} σ) {0.side} the prediction {0.since}",
         "the sensor, an input or a parameter is biased; hold {0.sensor} out to compare",
-        statistic="mean of e, tested at ± 0.2, ± 0.5 and ± 1.5",
         effect="mean of e",
         unit="σ",
         alarms={
@@ -176,7 +171,6 @@ DETECTORS = (
         "correlated",
         "innovations of {0.name} are correlated ({0.size:+.2f}) {0.since}",
         "increase {0.process_noise}, or add the missing state to the model",
-        statistic="lag-1 correlation of e, tested at 0.25 and 0.6",
         effect="lag-1 correlation",
         alarms={"correlated": (correlation_ratio(0.25), correlation_ratio(0.6))},
     ),
@@ -184,7 +178,6 @@ DETECTORS = (
         "alternating",
         "innovations of {0.name} alternate in sign ({0.size:+.2f}) {0.since}",
         "reduce {0.process_noise}; the estimate follows the noise",
-        statistic="lag-1 correlation of e, tested at -0.25 and -0.6, and innovations of a gain that follows the noise",
         effect="lag-1 correlation",
         alarms={"alternating": (correlation_ratio(-0.25), correlation_ratio(-0.6))},
     ),
@@ -192,7 +185,6 @@ DETECTORS = (
         "spiky",
         "{0.name} has spikes {0.since}: {0.percent:.2g} % of its measurements are outliers",
         "check the wiring, and set a gate unless the asset jumps (nisus advise tests it)",
-        statistic="mixtures in which 3 % or 0.3 % of e have 5 σ",
         effect="share of |e| beyond 4 σ",
         alarms={"spiky": (outlier_density(0.03), outlier_density(0.003, rare=True))},
     ),
@@ -200,7 +192,6 @@ DETECTORS = (
         "refused",
         "{0.name} is rejected by the gate {0.since} ({0.percent:.0f} % of its measurements)",
         "the sensor or the twin is wrong; {0.cross_check}",
-        statistic="share of rejected measurements, tested at 30 %",
         effect="share of rejected measurements",
         alarms={"refused": ()},
         severity=2,
@@ -211,7 +202,6 @@ DETECTORS = (
         "stuck",
         "{0.name} is {0.held} at {0.size:.6g}{0.spaced_unit} {0.since}: {0.observed_by}",
         "hold it out until it is repaired",
-        statistic="repeated values",
         effect="the value",
         alarms={"stuck": ()},
         severity=2,
@@ -221,7 +211,6 @@ DETECTORS = (
         "disagreeing",
         "rows of {0.sensor} contradict each other {0.since}",
         "increase R.{0.sensor}, or check which of them is wrong",
-        statistic="NIS of all rows together, as variances 1.5, 2.5 and 6",
         effect="√(NIS / degrees of freedom)",
         unit="×",
         alarms={"disagreeing": ()},
@@ -230,7 +219,6 @@ DETECTORS = (
         "agreeing",
         "rows of {0.sensor} are closer to the prediction than their noise {0.since}",
         "reduce R.{0.sensor}",
-        statistic="NIS of all rows together, as variances 0.6, 0.3 and 0.05",
         effect="√(NIS / degrees of freedom)",
         unit="×",
         alarms={"agreeing": ()},
@@ -240,7 +228,6 @@ DETECTORS = (
         "screened",
         "{0.name} violates its limits ({0.reasons}) {0.since}: {0.percent:.0f} % of its measurements are not used",
         "{0.observed_by}; check the sensor, or sensors.{0.sensor} in the YAML",
-        statistic="share of measurements beyond their limits",
         effect="share of measurements beyond their limits",
         severity=2,
         sensor_lost=True,
@@ -249,7 +236,6 @@ DETECTORS = (
         "silent",
         "{0.name} {0.dropout}: {0.observed_by}",
         "check its wiring and its bus",
-        statistic="time since the last measurement, in mean periods",
         effect="duration",
         unit="s",
         severity=2,
@@ -258,7 +244,6 @@ DETECTORS = (
         "never heard",
         "{0.name} {0.dropout}: {0.observed_by}",
         "check its channel map and its bus",
-        statistic="time since the start",
         effect="duration",
         unit="s",
         severity=2,
@@ -267,36 +252,30 @@ DETECTORS = (
         "outside",
         "{0.name} is {0.size:.4g}{0.spaced_unit}, outside {0.limits} where the model was fitted, {0.since}",
         "bands are valid only inside; fit the model there",
-        statistic="value of a state or an input",
         effect="the value",
     ),
     Detector(
         "impossible",
         "{0.name} is wrong {0.since}, as it reached {0.size:.4g}{0.spaced_unit} with a band beyond {0.limits}",
         "a sensor has an offset or a wrong scale, or the model is wrong: `nisus check` compares them",
-        statistic="band of a state beside its physical limits",
         effect="the value",
     ),
     Detector(
         "corrected",
         "{0.name} is corrected {0.since} by more than its band allows, over its memory or from its prior",
         "its true value may lie outside the band, as the model or an input is wrong; `nisus check` compares them",
-        statistic="sum of corrections that leave 20 to 90 % of the variance of a forecast, tested at variance 2.5; "
-        "the first measurement of a sensor beyond 5 σ",
         effect="the value",
     ),
     Detector(
         "impoverished",
         "the particle cloud is impoverished {0.since}: {0.size:.3g} effective particles, all from {0.ancestors}",
         "use more particles, pf-ekf or pf-reg, or increase Q of the states that hardly move",
-        statistic="effective sample size and number of ancestors",
         effect="effective sample size",
     ),
     Detector(
         "stale",
         "no measurement was used {0.since}: the estimate is a prediction of the model",
         "check the source",
-        statistic="time since the last used measurement",
         effect="duration",
         unit="s",
         severity=1,
@@ -305,23 +284,20 @@ DETECTORS = (
         "diverged",
         "the estimate has diverged {0.since}{0.contradiction}",
         "{0.reset_advice}",
-        statistic="mean NIS of the window, share of rejected measurements",
         effect="duration",
         unit="s",
         severity=0,
     ),
     Detector(
         "dropped",
-        "{0.percent:.3g} % of the measurements were dropped, {0.counts}: too late, or with an impossible time",
-        "check the times of the source, or increase time.max_delay",
-        statistic="share of measurements that are not in the log",
+        "{0.percent:.3g} % of the measurements were dropped, {0.counts}: too late, or with impossible times",
+        "check the times of the source, or lengthen time.max_delay",
         effect="share of measurements",
     ),
     Detector(
         "repeating",
         "{0.name} repeats its values: {0.repeats.reason}",
         "give its channel in `source` the key repeats: {0.repeats.key}",
-        statistic="share of large changes that are followed by equal values, and runs of equal values",
         effect="share of measurements",
     ),
 )

@@ -60,15 +60,10 @@ class Score(NamedTuple):
     among the gate's verdicts; NaN without any.
 
     states: fits against the truth, by state; held_out: fits of held-out measurements, by sensor row; field: fit of all
-    cells of a large field at the times of its true values, or None. commissioned: whether the bounds are those of the
-    baseline; nis_judged: the NIS to compare with these (consistency.py). nis_dof: mean degrees of freedom of the used
-    measurements, by which the NIS and its bounds are divided where they are shown. nis_white: bounds of white Gaussian
-    innovations.
+    cells of a large field at the times of its true values, or None.
     """
 
-    nis: float
-    nis_low: float
-    nis_high: float
+    nis_verdict: NisVerdict
     nis_readings: int
     log_likelihood: float
     log_likelihood_used: float
@@ -79,16 +74,27 @@ class Score(NamedTuple):
     states: dict[str, Fit]
     held_out: dict[str, Fit]
     field: Fit | None = None
-    commissioned: bool = False
-    nis_judged: float = np.nan
-    nis_dof: float = 1.0
-    nis_white: tuple[float, float] = (np.nan, np.nan)
 
     @property
-    def nis_verdict(self) -> NisVerdict:
-        """Whether the mean NIS is within its bounds."""
-        bounds = self.nis_low, self.nis_high
-        return NisVerdict(self.nis, *bounds, self.commissioned, self.nis_judged, self.nis_dof, *self.nis_white)
+    def nis(self) -> float:
+        """Mean NIS of the used measurements."""
+        return self.nis_verdict.nis
+
+    @property
+    def nis_low(self) -> float:
+        """Lower end of its 95 % bounds."""
+        return self.nis_verdict.low
+
+    @property
+    def nis_high(self) -> float:
+        """Upper end of its 95 % bounds."""
+        return self.nis_verdict.high
+
+    @property
+    def log_likelihood_reading(self) -> float:
+        """Log-likelihood of a measurement, used or rejected, which compares runs of different length."""
+        judged = self.nis_readings + self.gated
+        return self.log_likelihood / judged if judged else np.nan
 
 
 def score(
@@ -112,7 +118,6 @@ def score(
         baseline: Baseline of the tuning, by which the NIS is judged.
     """
     used = track.verdict == USED
-    verdict = nis_verdict(track, events, model, baseline)
     count, verdicts = int(used.sum()), np.bincount(track.verdict, minlength=len(VERDICT_NAMES))
     gated = int(verdicts[GATED])
     likelihood = float(track.log_likelihood[used].sum())
@@ -122,9 +127,7 @@ def score(
         if finite.any():
             held_out[item.name] = _fit(-item.error[finite], item.std[finite])
     return Score(
-        nis=verdict.nis,
-        nis_low=verdict.low,
-        nis_high=verdict.high,
+        nis_verdict=nis_verdict(track, events, model, baseline),
         nis_readings=count,
         log_likelihood=likelihood + float(log_density(track.select(track.verdict == GATED), gate).sum()),
         log_likelihood_used=likelihood,
@@ -135,10 +138,6 @@ def score(
         states={item.name: _fit(-item.error, item.std) for item in true_states(model, events, track)},
         held_out=held_out,
         field=_over_field(pictures),
-        commissioned=verdict.commissioned,
-        nis_judged=verdict.judged,
-        nis_dof=verdict.dof,
-        nis_white=(verdict.white_low, verdict.white_high),
     )
 
 

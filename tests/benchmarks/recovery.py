@@ -179,10 +179,10 @@ def recover(case: Case, count: int) -> Recovered:
         other = logs[(k + 1) % count]
         fold = folded(twin.estimator, twin.model, other, fitted.setting.tuning)
         result = score(fold.track, other.events, twin.model, gate=twin.tuning.gate)
-        low, high = result.nis_white
+        *_, low, high = result.nis_verdict
         off = abs(result.nis - 0.5 * (high + low))
         chance = 0.5 * (high - low) / Z
-        spread = float(np.hypot(chance, of_the_fit(twin, fitted, other)))
+        spread = np.hypot(chance, of_the_fit(twin, fitted, other))
         # Bounds of 99 %: they are asked 50 times.
         found.consistent += off <= Z99 * spread
         found.without += off <= Z99 * chance

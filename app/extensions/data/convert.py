@@ -15,7 +15,7 @@ import numpy as np
 
 from estimators.errors import SourceError
 
-from .sets import Recording
+from .sets import RecordingSet
 
 UTC_S = 1533180079.646
 """UTC of the RAV4's boot, s since 1970, by the clock of its u-blox receiver."""
@@ -32,7 +32,7 @@ MOTOR_HEADERS = {
 MOTOR_SESSION, MOTOR_ROWS = 60, 3600
 
 
-def comma2k19(recording: Recording) -> None:
+def comma2k19(recording: RecordingSet) -> None:
     """Write the arrays of comma2k19 as BLF and CSV, in UTC.
 
     Frames that the logger sent (buses 128 and 129) are left out. NumPy has stripped trailing zeros of the data, which
@@ -58,20 +58,20 @@ def comma2k19(recording: Recording) -> None:
     _write(recording, fixes)
 
 
-def labyrinth(recording: Recording) -> None:
+def labyrinth(recording: RecordingSet) -> None:
     """Write the lines of the three kinds of libRSF as CSVs."""
     lines = [line.split() for file in recording.files for line in (recording.parts / file.to).read_text().splitlines()]
     _write(recording, lambda kind: np.array([line[1:] for line in lines if line[0] == kind], float))
 
 
-def plaza(recording: Recording) -> None:
+def plaza(recording: RecordingSet) -> None:
     """Write the matrices of the MAT file as CSVs."""
     from scipy.io import loadmat
 
     _write(recording, loadmat(recording.parts / "Plaza1_.mat").__getitem__)
 
 
-def era5(recording: Recording) -> None:
+def era5(recording: RecordingSet) -> None:
     """Write the first 14 days of the hourly GRIB as a NumPy archive: t2m_K (336, 33, 49), K.
 
     A message has R + 2^E x with x of 16 bits, and R as sign, exponent of 16 and mantissa. The archive is in steps of
@@ -91,7 +91,7 @@ def era5(recording: Recording) -> None:
     )
 
 
-def motor_headers(recording: Recording) -> None:
+def motor_headers(recording: RecordingSet) -> None:
     """Write the arrays of two C headers as a CSV. Coolant and ambient are hundredths of 1 °C there."""
     columns: dict[str, np.ndarray] = {}
     for name, order in MOTOR_HEADERS.items():
@@ -101,7 +101,7 @@ def motor_headers(recording: Recording) -> None:
     _motor(recording, columns | {name: np.round(100.0 * columns[name], 4) for name in ("coolant", "ambient")})
 
 
-def motor_table(recording: Recording, path: Path) -> None:
+def motor_table(recording: RecordingSet, path: Path) -> None:
     """Write session 60 of Kaggle's table as a CSV, with each column but temperatures divided by its largest magnitude.
 
     Raises:
@@ -123,7 +123,7 @@ def motor_table(recording: Recording, path: Path) -> None:
     _motor(recording, {name: columns[name][rows] / scale[name] for name in names})
 
 
-def _motor(recording: Recording, columns: Mapping[str, np.ndarray]) -> None:
+def _motor(recording: RecordingSet, columns: Mapping[str, np.ndarray]) -> None:
     """Write the CSV of the motor; refuse values that are not those to which the twins were tuned."""
     t = np.arange(min(MOTOR_ROWS, len(columns["u_q"])))
     for name, expected in recording.means.items():
@@ -134,7 +134,7 @@ def _motor(recording: Recording, columns: Mapping[str, np.ndarray]) -> None:
     _write(recording, lambda _: np.column_stack([0.5 * t, *(columns[name][: t.size] for name in recording.means)]))
 
 
-def _write(recording: Recording, rows: Callable[[str], np.ndarray]) -> None:
+def _write(recording: RecordingSet, rows: Callable[[str], np.ndarray]) -> None:
     """Write the CSVs of a recording, with the shortest digits that give the same numbers."""
     for name, (origin, head) in recording.csv.items():
         width = head.count(",") + 1

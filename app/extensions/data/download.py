@@ -1,7 +1,7 @@
 """Download of a recording from its source, or copy of the user's files, and conversion.
 
-Files of the source stay in `Recording.parts` until all are there, so that a download that was cut off goes on where it
-ended. Only files with the SHA-256 of sets.yaml are used.
+Files of the source stay in `RecordingSet.parts` until all are there, so that a download that was cut off goes on where
+it ended. Only files with the SHA-256 of sets.yaml are used.
 """
 
 from __future__ import annotations
@@ -26,7 +26,7 @@ from estimators.errors import ConfigError, SourceError
 from sources.worker_process import gist
 
 from . import convert
-from .sets import Recording, SourceFile, size_text
+from .sets import RecordingSet, SourceFile, size_text
 
 RETRIES = 3
 """Further attempts at a file, after 1, 2 and 3 s."""
@@ -47,7 +47,7 @@ REMEDIES = {
 pooch.get_logger().setLevel(logging.WARNING)  # its own lines of progress
 
 
-def get(recording: Recording, given: Sequence[Path] = ()) -> None:
+def get(recording: RecordingSet, given: Sequence[Path] = ()) -> None:
     """Put the files of a recording that are missing into its folder; `given` are files that are read, not downloaded.
 
     Raises:
@@ -80,7 +80,7 @@ def get(recording: Recording, given: Sequence[Path] = ()) -> None:
         raise SourceError(f"{error.filename or folder.parent}: {gist(error)}; {remedy}") from None
 
 
-def _download(recording: Recording) -> None:
+def _download(recording: RecordingSet) -> None:
     """Download the files of the source that are not there yet."""
     hashes = {file.to: f"sha256:{file.sha256}" for file in recording.files}
     urls = {file.to: file.url for file in recording.files}
@@ -121,7 +121,7 @@ def _resume(file: SourceFile, part: Path, url: str, output: str, _: Any) -> None
     os.replace(part, output)
 
 
-def _copy(recording: Recording, given: Sequence[Path]) -> None:
+def _copy(recording: RecordingSet, given: Sequence[Path]) -> None:
     """Copy the files of the source from those of the user, which are known by their SHA-256."""
     found = {}
     for path in given:

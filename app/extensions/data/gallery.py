@@ -14,7 +14,7 @@ from app.web.gallery.dropped_logs import ReaderJob
 from app.web.http import get, post
 from estimators.errors import ConfigError
 
-from .sets import Recording, find, recordings
+from .sets import RecordingSet, find, recordings
 
 REPORT_PERIOD_S = 0.2
 """Time between two reports of progress."""
@@ -40,7 +40,7 @@ def begin(name: str) -> JsonObject:
     return state()
 
 
-def downloaded(folder: Path, recording: Recording) -> Iterator[str]:
+def downloaded(folder: Path, recording: RecordingSet) -> Iterator[str]:
     """Download a recording in a process of its own, as the conversion would delay a twin; yield the progress."""
     from .download import get
 

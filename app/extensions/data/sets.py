@@ -32,8 +32,8 @@ class SourceFile:
 
 
 @dataclass(frozen=True)
-class Recording:
-    """Recording of some bundled twins, and its folder on this machine; sets.yaml describes the fields."""
+class RecordingSet:
+    """Recorded data of some bundled twins, and its folder on this machine; sets.yaml describes the fields."""
 
     name: str
     folder: Path
@@ -85,17 +85,17 @@ class Recording:
         return {**facts, "host": host, "folder": str(self.folder), "present": not self.lacking}
 
 
-def recordings() -> dict[str, Recording]:
+def recordings() -> dict[str, RecordingSet]:
     """Return all recordings by name."""
     server = (os.environ.get(MIRROR) or SERVER).rstrip("/")
     table = yaml.load(Path(__file__).with_name("sets.yaml").read_text(), getattr(yaml, "CSafeLoader", yaml.SafeLoader))
     for fields in table.values():
         fields["files"] = [SourceFile(f"{server}/{quote(file.pop('url'))}", **file) for file in fields["files"]]
         fields.setdefault("makes", [file.to for file in fields["files"]])
-    return {name: Recording(name, recordings_folder() / name, **fields) for name, fields in table.items()}
+    return {name: RecordingSet(name, recordings_folder() / name, **fields) for name, fields in table.items()}
 
 
-def find(name: str) -> Recording:
+def find(name: str) -> RecordingSet:
     """Return a recording by its name or that of one of its twins.
 
     Raises:

@@ -10,7 +10,7 @@ from config.yaml_files import Key, dotted
 from estimators.model.state_space import StateSpaceModel
 
 from ..channels import read_faults
-from ..checks import check_names, one_each
+from ..checks import check_names, row_variances
 from ..defaults import parameter_sections
 from ..model import find_model
 from .kind import Kind, Opening
@@ -45,10 +45,7 @@ def make_asset(loaded: Loaded, model: StateSpaceModel, section: AssetSection, ke
         plan = section.sensors.get(sensor.name)
         if plan is None:
             continue
-        variances = plan.variances
-        if variances is not None:
-            place = (*key, "sensors", sensor.name, "std" if plan.std is not None else "variance")
-            variances = one_each(loaded, place, variances, [row.name for row in sensor.rows])
+        variances = row_variances(loaded, (*key, "sensors", sensor.name), plan, sensor) or None
         plans[sensor.name] = SensorPlan(every=plan.every, variances=variances, drop_every=plan.drop_every)
     return Simulator(
         model,

@@ -8,9 +8,9 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from app.derive.forecast import Forecasts, forecast_json, question_from_json, recorded
+from app.derive.forecast import ForecastQuestion, Forecasts, forecast_json, recorded
 from app.engine.engine import Engine
-from app.web.http import OneAtATime
+from app.web.http import OneAtATime, parse
 from app.web.server import PageServer
 from estimators.errors import ConfigError
 from estimators.forecast import Crossing, Forecast, forecast
@@ -32,8 +32,7 @@ def running(n=200):
 
 
 def ask(engine, **body):
-    answer = Forecasts(engine).compute(question_from_json(body, engine.model))
-    return json.loads(json.dumps(answer, allow_nan=False))
+    return json.loads(json.dumps(Forecasts(engine).compute(ForecastQuestion(**body)), allow_nan=False))
 
 
 def test_the_answer_is_the_closed_form_in_steps_of_the_readings():
@@ -146,7 +145,8 @@ def test_nothing_of_the_running_twin_changes():
 
 @cases(__file__, "refused_forecasts.csv")
 def test_what_cannot_be_asked_is_refused_in_one_line(body, reason):
-    assert reason in error_of(ConfigError, question_from_json, json.loads(body), MODELS["motor_drive"])
+    body = json.loads(body)
+    assert reason in error_of(ConfigError, lambda: parse(ForecastQuestion, body, "it").check(MODELS["motor_drive"]))
 
 
 def test_a_forecast_needs_measurements_and_has_a_longest_horizon():

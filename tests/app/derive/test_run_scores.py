@@ -34,7 +34,7 @@ def test_scores_are_those_of_a_refold():
         used = track.verdict == USED
         assert known.score.nis == pytest.approx(track.nis[used].mean(), rel=1e-9)
         assert known.score.log_likelihood == pytest.approx(track.log_likelihood[used].sum(), rel=1e-9)
-        assert known.log_likelihood_reading == pytest.approx(track.log_likelihood[used].mean(), rel=1e-9)
+        assert known.score.log_likelihood_reading == pytest.approx(track.log_likelihood[used].mean(), rel=1e-9)
         assert known.rows == 800 and known.seconds == pytest.approx(79.9)
         assert known.step_us > 0.0
 

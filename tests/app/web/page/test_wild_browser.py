@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from app.derive.forecast import Forecasts, question_from_json
+from app.derive.forecast import ForecastQuestion, Forecasts
 from app.web.streams import belief_json
 from estimators.log import READING
 from tests.app.scripted import pull_all
@@ -194,5 +194,5 @@ def test_a_withheld_estimate_has_its_reason_in_place_of_a_value_and_a_band_witho
         engine = session.engine
         assert np.isnan(engine.belief().mean[1]) and np.isfinite(engine.belief().mean[0])
         assert belief_json(engine, [0, 1]) is None
-        told = Forecasts(engine).compute(question_from_json({"horizon": 5.0}, engine.model))["states"]
+        told = Forecasts(engine).compute(ForecastQuestion(5.0))["states"]
         assert set(told["rate"]["mean"]) == {None} and None not in told["rate"]["upper2"] + told["temperature"]["mean"]
