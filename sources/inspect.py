@@ -27,7 +27,7 @@ from .formats import CAN_LOGS, EITHER, check_once, check_present, holds_signals,
 from .source import UNDATED, Channel, ignore
 from .tables.dialect import DETECTED, QUALITY_WORD, TIME_NAME, TIME_NAMES, Dialect
 from .tables.order import Order, time_order
-from .tables.rows import TableRows, cells_of, format_of, names_of, remarks_of, rows_of
+from .tables.rows import TableRows, cells_of, format_of, is_text, names_of, remarks_of, rows_of
 from .tables.text import NO_VALUE, UNREADABLE, TextMatch
 from .tables.times import EPOCH_S, SERIAL_DAYS, SKIPPED, TWICE, TimeColumn, TimeReader
 from .units import heading_unit, suffix_unit, unknown_unit
@@ -339,7 +339,7 @@ def _tables(files: list[Path], time: TimeColumn, dialect: Dialect) -> RecordingC
     if len(names) < 2:
         raise SourceError(
             f"{files[0]}: has one column, {quoted(names[0] if names else '')}; a table has a header, a column of times "
-            "and one of values: if it has, give --delimiter, or --skip for lines before it"
+            "and one of values" + ": if it has, give --delimiter, or --skip for lines before it" * is_text(files[0])
         )
     if chosen is None:
         raise SourceError(

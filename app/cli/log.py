@@ -93,7 +93,10 @@ def contents_of(files: tuple[Path, ...], options: TableOptions) -> RecordingCont
             raise ConfigError(f"--dbc {path}: there is no such file; check the path")
     tables = [is_table(file) for file in files if file.is_file()]
     if databases and tables and all(tables):
-        raise ConfigError(f"--dbc {databases[0][0]}: describes CAN logs, and {files[0]} is a table; leave it out")
+        rule = f"describes CAN logs, and {files[0]} is a table"
+        raise ConfigError(
+            f"--dbc {databases[0][0]}: {rule}; leave it out, or export frames that it holds as ASC or BLF"
+        )
     if options.time and tables and not any(tables):
         raise ConfigError(f"--time {quoted(options.time)}: is for tables, and {files[0]} is a CAN log; leave it out")
     time = TimeColumn(options.time or "", options.time_unit, options.time_format, zone)

@@ -15,7 +15,7 @@ import can
 from estimators.errors import SourceError
 from estimators.log import Events
 
-from ..formats import CAN_LOGS, EITHER, check_present, is_compressed, suffix_of
+from ..formats import CAN_LOGS, EITHER, archive_of, check_present, is_compressed, suffix_of
 from ..source import NEVER, TRUNCATED, Recorded, Report, ignore
 from ..units import second_ns
 from ..worker_process import IsolatedReader, read_isolated
@@ -124,7 +124,11 @@ def check_log(path: Path) -> None:
         SourceError: If the file is missing, empty, or of no known format, or the package that reads it is missing.
     """
     check_present(path)
-    if suffix_of(path) not in (*CAN_LOGS, *EITHER) or (is_compressed(path) and path.suffix.lower() != ".gz"):
+    known, archive = suffix_of(path) in (*CAN_LOGS, *EITHER), archive_of(path)
+    if known and (archive or (is_compressed(path) and path.suffix.lower() != ".gz")):
+        text = f"is a CAN log, of which only .gz is unpacked; unpack {(archive or path).name}, and name the logs"
+        raise SourceError(f"{path}: {text}")
+    if not known:
         raise SourceError(
             f"{path}: {path.suffix or 'a bare name'} is not a CAN log format; choose from {', '.join(CAN_LOGS)}"
         )

@@ -191,6 +191,14 @@ def _vectors(path: Path) -> dict[str, np.ndarray]:
     for name, value in content.items():
         if not name.startswith("__"):
             _collect(name, value, found)
+    if len(found) < 2:
+        shapes = {name: np.shape(value) for name, value in content.items() if not name.startswith("__")}
+        kinds = {name: type(content[name]).__name__.removeprefix("mat_") for name in shapes}
+        held = ", ".join(f"{name} ({'×'.join(map(str, shape)) or kinds[name]})" for name, shape in shapes.items())
+        raise SourceError(
+            f"{path}: a table has a vector of times and one of values, and it holds {held}; save each "
+            f"column as a vector, or those of a struct s with save('{path.name}', '-struct', 's', '-v7')"
+        )
     return found
 
 

@@ -309,12 +309,17 @@ class _Table:
             names, first = [f"c{k}" for k in range(1, width + 1)], rows[0].line
             if given.heading != 0:
                 remarks.append(f"no heading, so columns are named c1 to c{width}")
-        decimal, group = _signs(path, rows, self.delimiter, given.decimal)
+        decimal, group, lone = _signs(path, rows, self.delimiter, given.decimal)
         comment = next((m[1] for line in self._lines[given.skip :] if (m := _COMMENT.match(line))), "")
         if self.delimiter == " " and given.delimiter is None:
             remarks.append("columns separated by spaces")
         if decimal == "," and given.decimal is None and (remarks or group or self.delimiter == ","):
             remarks.append("decimal comma")
+        if lone:
+            thousands, number = lone.replace(",", ""), float(lone.replace(",", "."))
+            remarks.append(
+                f"{lone} is taken as {number:g}; give --decimal . (decimal of the source) if it is {thousands}"
+            )
         if group:
             remarks.append(f"thousands separator {', '.join(map(repr, group))}")
         if comment:
@@ -392,8 +397,8 @@ _WHOLE = re.compile(r"[+-]?\d{1,3}")
 _DOTTED_DATE = re.compile(r"\d{1,2}\.\d{1,2}\.\d{2,4}\b.*")
 
 
-def _signs(path: Path, rows: Sequence[_Row], delimiter: str, given: str | None) -> tuple[str, str]:
-    """Return the decimal sign of the numbers, and the signs between their thousands.
+def _signs(path: Path, rows: Sequence[_Row], delimiter: str, given: str | None) -> tuple[str, str, str]:
+    """Return the decimal sign of the numbers, the signs between their thousands, and a number that may be two.
 
     Raises:
         SourceError: If 1,234 may be 1234 as well as 1.234.
@@ -421,4 +426,4 @@ def _signs(path: Path, rows: Sequence[_Row], delimiter: str, given: str | None) 
     group = dict.fromkeys(found[1] for cell in cells if (found := _SPACED.fullmatch(cell)))
     if (commas or lone) if decimal == "." else some(_POINTS):
         group[",."[decimal == ","]] = None
-    return decimal, "".join(group)
+    return decimal, "".join(group), lone if lone and given is None and decimal == "," and not sure else ""

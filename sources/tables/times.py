@@ -162,7 +162,7 @@ class TimeReader:
         t = np.zeros(len(cells), np.int64)
         known, naive = np.zeros((2, len(cells)), np.bool_)
         for k, cell in enumerate(cells):
-            found = self._of_text(cell)
+            found = self._of_text(f"20{cell}" if self._order == "year" else cell)
             if found is not None and abs(found[0]) <= MAX_TIME_NS:
                 (t[k], naive[k]), known[k] = found, True
             if cell == self._day and is_day(cell):
@@ -343,14 +343,24 @@ class _SummerTime:
         return second if late else first
 
 
+_SHORT = re.compile(r"(\d\d)-(\d\d)-(\d\d)(?!\d)")  # 24-03-15
+
+
 def _day_and_month(name: str, cells: Sequence[str]) -> str:
-    """Return which comes first in dates such as 25.10.2020: "day" or "month".
+    """Return which comes first in dates such as 25.10.2020: "day" or "month", or "year" of two digits.
 
     Raises:
         SourceError: If the cells do not show it.
     """
-    unclear = None
-    for cell in islice(cells, MAX_DETECTION_CELLS):
+    unclear, words = None, ("day{0}month", "month{0}day")
+    short = [match.groups() for match in map(_SHORT.match, islice(cells, MAX_DETECTION_CELLS)) if match]
+    if short and all(middle < "13" and last < "32" for _, middle, last in short):
+        firsts, lasts = ({one[k] for one in short} for k in (0, 2))
+        if len(lasts) > len(firsts) or max(firsts) > "31":  # The day changes more often than the year.
+            return "year"
+        if len(lasts) == len(firsts) and max(firsts) > "12":
+            unclear, words = next(filter(_SHORT.match, cells)), ("year-month-day", "day-month-year")
+    for cell in cells[: 0 if unclear else MAX_DETECTION_CELLS]:
         found = layout(cell)
         if found is None or not found.either:
             continue
@@ -365,11 +375,12 @@ def _day_and_month(name: str, cells: Sequence[str]) -> str:
     found = layout(unclear)
     assert found is not None
     separator, year = unclear.lstrip("0123456789")[0], "%y" if found.digits == 2 else "%Y"
-    day, month = (separator.join(order) for order in (("%d", "%m", year), ("%m", "%d", year)))
+    orders = {"d": ("%d", "%m", year), "m": ("%m", "%d", year), "y": (year, "%m", "%d")}
+    formats = [separator.join(orders[word[0]]) for word in words]
     directives = iter(("%I" if found.half else "%H", "%M", "%S", "%f"))
     _, rest = re.split(r"^\d+\D+\d+\D+\d+", unclear)
     clock = re.sub(r"[AP]M", "%p", re.sub(r"\d+", lambda _: next(directives), rest, count=len(found.clock)), flags=re.I)
     raise SourceError(
-        f"{name} is {quoted(unclear)}, which may be day{separator}month or month{separator}day; set the time's format "
-        f'(time.format, --time-format): "{day}{clock}" or "{month}{clock}"'
+        f"{name} is {quoted(unclear)}, which may be {' or '.join(words).format(separator)}; set the time's format "
+        f'(time.format, --time-format): "{formats[0]}{clock}" or "{formats[1]}{clock}"'
     )

@@ -16,12 +16,13 @@ from estimators.log import READING
 from sources.can import log as can_log
 from sources.can.decoder import Decoder
 from sources.can.log import CanLog
+from sources.inspect import inspect_recordings
 from sources.source import Channel
 from sources.tables.table import Table, TimeColumn
 from tests.sources import readers_that_fail
 from tests.sources.can.can_tools import Reports, dbc, decoding, sensor
 from tests.sources.can.test_log import decoder_of, messages, read, write  # noqa: F401  a fixture
-from tests.support import read_all
+from tests.support import error_of, read_all
 
 
 def flipped(content, seed, *, most=200):
@@ -244,3 +245,25 @@ def test_a_column_without_a_value_is_named(tmp_path, ending):
     read_all(Table([path], time=TimeColumn("t"), channels=channels, width=1, report=reports))
     assert reports.counts == {"never seen": 1}
     assert reports.texts["never seen"] == f"a{ending}: column 'y' has no value in 5 rows, so why has no values"
+
+
+@pytest.mark.parametrize(
+    ("content", "held"),
+    [
+        ({"data": np.zeros((9, 3))}, "data (9×3)"),
+        ({"s": {"data": np.zeros((9, 3)), "name": "x"}, "k": 3.0}, "s (struct), k (float)"),
+    ],
+)
+def test_a_matlab_file_without_vectors_says_what_it_holds_and_how_to_save_it(tmp_path, content, held):
+    savemat(tmp_path / "a.mat", content)
+    text = error_of(SourceError, inspect_recordings, [tmp_path / "a.mat"])
+    assert text == (
+        f"{tmp_path / 'a.mat'}: a table has a vector of times and one of values, and it holds {held}; save each column "
+        "as a vector, or those of a struct s with save('a.mat', '-struct', 's', '-v7')"
+    )
+
+
+def test_an_archive_of_one_array_is_not_told_of_delimiters(tmp_path):
+    np.savez(tmp_path / "a.npz", x=np.zeros(9))
+    text = error_of(SourceError, inspect_recordings, [tmp_path / "a.npz"])
+    assert text.endswith("has one column, 'x'; a table has a header, a column of times and one of values")

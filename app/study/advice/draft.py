@@ -102,15 +102,22 @@ def model_of(name: str) -> str:
 
 
 def write_pair(name: str, folder: Path, yaml_text: str, python_text: str) -> tuple[Path, Path]:
-    """Write the two files of a twin.
+    """Write the two files of a twin, or none of them.
 
     Raises:
         ConfigError: If the folder cannot be written to.
     """
     paths = folder / f"{name}.yaml", folder / f"{name}.py"
-    for path, text in zip(paths, (yaml_text, python_text), strict=True):
-        with writing(path), path.open("x", encoding="utf-8") as file:
-            file.write(text)
+    begun: list[Path] = []
+    try:
+        for path, text in zip(paths, (yaml_text, python_text), strict=True):
+            with writing(path), path.open("x", encoding="utf-8") as file:
+                begun.append(path)
+                file.write(text)
+    except ConfigError:  # What is left of it would be in the way of the next attempt.
+        for path in begun:
+            path.unlink()
+        raise
     return paths
 
 

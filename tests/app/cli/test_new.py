@@ -90,3 +90,21 @@ def test_the_pair_folds_and_does_what_its_text_promises(tmp_path):
     nis = track.nis[(events.kind == READING) & (track.verdict == USED)]
     low, high = chi2.ppf([0.00005, 0.99995], nis.size) / nis.size
     assert low < nis.mean() < high
+
+
+@pytest.mark.parametrize("name", ["pump.yaml", "pump.py"])
+def test_a_full_disk_leaves_nothing_that_is_in_the_way(name, tmp_path, monkeypatch):
+    whole = Path.open
+
+    def full(path, *mode, **options):
+        file = whole(path, *mode, **options)
+        if path.name == name:
+            file = whole(Path("/dev/full"), "w", buffering=1)
+        return file
+
+    with monkeypatch.context() as patched:
+        patched.setattr(Path, "open", full)
+        said = refused("pump", tmp_path)
+    assert said == f"{tmp_path / name}: cannot be written: No space left on device; check free space and permissions"
+    assert not list(tmp_path.iterdir())
+    assert write_twin("pump", tmp_path)[0].is_file()

@@ -5,6 +5,7 @@ import re
 import shutil
 import sys
 import threading
+import zipfile
 
 import can
 import cantools
@@ -175,6 +176,18 @@ def test_a_file_that_is_no_log_is_one_line(tmp_path, capfd, name, content, expec
     text = error_of(SourceError, lambda: read_all(CanLog([path], decoder_of(tmp_path))))
     assert text.startswith(f"{path}: {expected}")
     assert "Traceback" not in capfd.readouterr().err
+
+
+@pytest.mark.parametrize("name", ["a.zip/drive.log", "a.zip/drive.log.gz", "drive.blf.bz2"])
+def test_a_compressed_log_that_is_not_read_says_what_to_do(tmp_path, name):
+    archive = tmp_path / name.partition("/")[0]
+    archive.write_bytes(b"BZ")
+    if archive.suffix == ".zip":
+        with zipfile.ZipFile(archive, "w") as file:
+            file.writestr(name.partition("/")[2], "(1710489600.0) can0 123#00\n")
+    text = error_of(SourceError, lambda: read_all(CanLog([tmp_path / name], decoder_of(tmp_path))))
+    rule = f"is a CAN log, of which only .gz is unpacked; unpack {archive.name}, and name the logs"
+    assert text == f"{tmp_path / name}: {rule}"
 
 
 def test_without_asammdf_an_mf4_file_names_its_extra(tmp_path, monkeypatch):

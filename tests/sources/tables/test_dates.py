@@ -9,8 +9,10 @@ from pathlib import Path
 import pyarrow as pa
 import pytest
 
+from estimators.errors import SourceError
 from sources.inspect import inspect_recordings
 from sources.tables.times import ASSUMED, TimeColumn, TimeReader
+from tests.support import error_of
 
 SPELLINGS = (Path(__file__).parent / "spellings.csv").read_text("utf-8").splitlines()[1:]
 MOMENT_NS = 1_710_489_600 * 10**9  # 2024-03-15T08:00:00Z by `date -u +%s`
@@ -233,3 +235,30 @@ def test_dates_without_a_time_zone_are_said_to_be_utc(tmp_path, rows):
     line = "a.csv: its dates have no time zone and are taken to be UTC; give one with --time-zone"
     assert inspect_recordings([tmp_path / "a.csv"]).faults == [line] * ("UTC" not in rows[0])
     assert inspect_recordings([tmp_path / "a.csv"], time=TimeColumn("time", zone="Europe/Berlin")).faults == []
+
+
+@pytest.mark.parametrize(
+    ("cells", "first"),
+    [
+        (["24-03-15 08:00", "24-03-15 08:01", "24-03-16 00:00"], MOMENT_NS),  # its last field changes, so it is the day
+        (["15-03-24 08:00", "16-03-24 00:00", "16-03-24 00:01"], MOMENT_NS),
+        (
+            ["15-03-99 08:00"],
+            MOMENT_NS + 27_393 * 86_400 * 10**9,
+        ),  # no month has 99 days; date -u -d 2099-03-15T08:00 +%s
+        (["99-03-15 08:00"], MOMENT_NS + 27_393 * 86_400 * 10**9),
+        (["03-15-24 08:00"], MOMENT_NS),  # nor has a year 15 months
+        (["15/03/24 08:00", "15/03/24 08:01"], MOMENT_NS),
+    ],
+)
+def test_the_order_of_three_fields_of_two_digits_is_known_from_the_rows(cells, first):
+    assert read(*cells)[0] == first
+
+
+def test_three_fields_of_two_digits_that_stay_open_are_refused():
+    text = error_of(SourceError, read, "24-03-15 08:00:00", "24-03-15 08:00:01")
+    assert text == (
+        "t is '24-03-15 08:00:00', which may be year-month-day or day-month-year; set the time's format (time.format, "
+        '--time-format): "%y-%m-%d %H:%M:%S" or "%d-%m-%y %H:%M:%S"'
+    )
+    assert read("24-03-15 08:00:00", format="%y-%m-%d %H:%M:%S") == [MOMENT_NS]

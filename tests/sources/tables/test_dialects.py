@@ -11,7 +11,7 @@ from estimators.log import READING
 from sources.inspect import inspect_recordings
 from sources.source import Channel
 from sources.tables.dialect import DETECTED, Dialect, dialect_of
-from sources.tables.rows import names_of
+from sources.tables.rows import names_of, remarks_of
 from sources.tables.table import Table
 from sources.tables.text import READ_AS
 from sources.tables.times import TimeColumn
@@ -249,3 +249,18 @@ def test_the_unit_of_a_heading_that_is_not_known_is_said(tmp_path):
     found = inspect_recordings([write(tmp_path, "t,A [NTU],B (cfu),C [bar]\n" + rows)])
     assert found.faults[0] == "the unit of A [NTU] and of 1 more is not known; give it under `units`"
     assert [one.unit for one in found.columns] == ["", "", "bar"]
+
+
+@pytest.mark.parametrize(
+    ("rows", "said"),
+    [
+        (["0;1,200", "1;1,250"], "1,200 is taken as 1.2; give --decimal . (decimal of the source) if it is 1200"),
+        (["0;1,200", "1;1,25"], None),
+        (["0;1,200", "1;0,250"], None),
+        (["0;1,200", "1;1.200,5"], None),
+    ],
+)
+def test_a_comma_that_may_be_a_sign_between_thousands_is_said(tmp_path, rows, said):
+    path = write(tmp_path, "t;x\n" + "\n".join(rows) + "\n")
+    assert inspect_recordings([path]).faults[:1] == ([f"drive.csv: {said}"] if said else remarks_of([path]))
+    assert "taken as" not in "".join(inspect_recordings([path], dialect=Dialect(decimal=",")).faults)
