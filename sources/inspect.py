@@ -29,7 +29,7 @@ from .tables.dialect import DETECTED, QUALITY_WORD, TIME_NAME, TIME_NAMES, Diale
 from .tables.order import Order, time_order
 from .tables.rows import TableRows, cells_of, format_of, is_text, names_of, remarks_of, rows_of
 from .tables.text import NO_VALUE, UNREADABLE, TextMatch
-from .tables.times import EPOCH_S, SERIAL_DAYS, SKIPPED, TWICE, TimeColumn, TimeReader
+from .tables.times import EPOCH_S, SERIAL_DAYS, SKIPPED, TWICE, WHOLE_CLOCK, TimeColumn, TimeReader
 from .units import heading_unit, suffix_unit, unknown_unit
 
 MAX_FRAME_BYTES = 64  # Bytes of the longest frame, of CAN FD
@@ -566,14 +566,14 @@ def _since_1970(cells: Sequence[str]) -> bool:
 def _with_clock(path: Path, names: Sequence[str], time: TimeColumn, dialect: Dialect) -> TimeColumn:
     """Return the time column; both, if it is one of a CSV with dates in one column and clocks in another."""
     rows = [[cell.strip() for cell in row] for row in islice(cells_of(path, dialect) or (), MAX_TEXTS)]
-    days, clocks = (
+    days, clocks, numbers = (
         [k for k in range(len(names)) if rows and all(is_one(row[k]) for row in rows)]
-        for is_one in (is_day, CLOCK.fullmatch)
+        for is_one in (is_day, CLOCK.fullmatch, WHOLE_CLOCK.fullmatch)
     )
     chosen = names.index(time.name)
     if time.clock is None and clocks and chosen in days:
         return time._replace(clock=names[min(clocks, key=lambda k: abs(k - chosen))])
-    return time._replace(name=names[days[0]], clock=time.name) if days and chosen in clocks else time
+    return time._replace(name=names[days[0]], clock=time.name) if days and chosen in clocks + numbers else time
 
 
 def _texts(files: list[Path], names: list[str], dialect: Dialect) -> dict[str, Counter[str]]:

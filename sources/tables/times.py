@@ -36,7 +36,7 @@ EPOCH_S = (631_152_000, 2_840_140_800)  # 1990 and 2060
 LABVIEW_S = 2_082_844_800  # From 1904-01-01, where LabVIEW counts from, to 1970
 _COMPACT = re.compile(r"(?:19|20)\d{10}(?:\d\d(?:\d{3})?)?")  # 20240315080000, with or without seconds and milliseconds
 _WHOLE_DAY = re.compile(r"(?:19|20)\d\d(?:0[1-9]|1[0-2])(?:0[1-9]|[12]\d|3[01])")  # 20240315
-_WHOLE_CLOCK = re.compile(r"(?:[01]\d|2[0-3])[0-5]\d[0-5]\d(?:\.\d*)?")  # 080010
+WHOLE_CLOCK = re.compile(r"(?:[01]\d|2[0-3])[0-5]\d[0-5]\d(?:\.\d*)?")  # 080010
 
 _NAMED_DAY = re.compile(r"(?<!\d)((?:19|20)\d\d)([-_.]?)(0[1-9]|1[0-2])\2(0[1-9]|[12]\d|3[01])(?!\d)")
 """A date in the name of a file."""
@@ -212,7 +212,7 @@ class TimeReader:
         if cells and all(_WHOLE_DAY.fullmatch(cell) and ns_of_date(cell, False) for cell in cells):
             self._spelt = "day"
             self.notes.append((0, ASSUMED, f"{self._column.label} is {cells[0]}, taken as a date"))
-        elif cells and self._midnight is not None and all(_WHOLE_CLOCK.fullmatch(_padded(cell)) for cell in cells):
+        elif cells and self._midnight is not None and all(WHOLE_CLOCK.fullmatch(_padded(cell)) for cell in cells):
             numbers = np.array(cells, float)
             seconds = numbers - 40.0 * (numbers // 100) - 2400.0 * (numbers // 10_000)
             steps, clocks = np.diff(numbers), np.diff(seconds)

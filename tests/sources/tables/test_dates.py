@@ -170,6 +170,15 @@ def test_seconds_of_labview_count_from_1904():
         assert note == f"t is {number}, taken as seconds since 1904, as of LabVIEW (2024-03-15)"
 
 
+@pytest.mark.parametrize("day", ["20240315", "15.03.2024"])
+def test_numbers_that_spell_clocks_follow_the_day_beside_them(tmp_path, day):
+    path = tmp_path / "log.csv"
+    path.write_text("Date,Time,level\n" + "".join(f"{day},{cell},{k % 7}\n" for k, cell in enumerate(CLOCK)))
+    found = inspect_recordings([path])
+    assert found.t.tolist() == [MOMENT_NS + (k - 8 * 3600 + 35_910) * 10**9 for k in range(len(CLOCK))]
+    assert [one.name for one in found.columns] == ["level"]
+
+
 @pytest.mark.parametrize(("unit", "day"), [("excel", 45_366), ("matlab", 739_326)])
 def test_serial_dates_that_are_read_as_seconds_are_named(tmp_path, unit, day):
     """Both are 2024-03-15, by a spreadsheet and by MATLAB's manual."""
