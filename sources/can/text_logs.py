@@ -34,8 +34,8 @@ CANEDGE = ("timestampepoch", "id", "ide", "buschannel", "datalength", "databytes
 """Columns that are read: time, id, whether it is extended, bus, number of bytes, and the first or all of the bytes."""
 
 CONSOLE = re.compile(
-    r"\s*(?:\((?P<time>\d+\.\d+|\d+-[-\d:. ]+)\)\s+)?(?P<bus>\S+)\s+(?:[RT]X\s+\S\s+\S\s+)?(?P<id>[0-9A-F]{3}|[0-9A-F]{8})\s+"
-    r"\[(?P<size>\d+)\](?P<data>.*)",
+    r"\s*(?:\((?P<time>\d+\.\d+|\d+-[-\d:. ]+)\)\s+)?(?P<bus>\S+)\s+(?:[RT]X\s+\S\s+\S\s+)?"
+    r"(?P<id>[0-9A-F]{3}|[0-9A-F]{8})\s+\[(?P<size>\d+)\](?P<data>.*)",
     re.IGNORECASE,
 )
 """A line of candump's console output, with the flags of its option -x."""

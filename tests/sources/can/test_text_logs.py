@@ -92,10 +92,8 @@ def test_a_garbled_first_line_of_candump_loses_only_itself(tmp_path, line):
     (tmp_path / "dump.log").write_text(f"{line}\n{lines_of(times)}")
     (item,), (fault,) = keys_and_times(tmp_path / "dump.log")
     assert item[3] == pytest.approx([START + 0.1, START + 0.25], abs=1e-6)
-    assert (
-        fault
-        == f"dump.log: damaged: 1 line cannot be read, the first line 1: it is no line of candump: {' '.join(line.split())}"
-    )
+    rule = "1 line cannot be read, the first line 1: it is no line of candump"
+    assert fault == f"dump.log: damaged: {rule}: {' '.join(line.split())}"
 
 
 def test_fields_of_candumps_console_output(tmp_path):
