@@ -89,7 +89,7 @@ Kind = Literal[
 RESERVED: Mapping[Kind, tuple[str, ...]] = {
     "sources": ("simulator", "can", "can_log", "table", "merged", "push"),
     "outputs": ("every", "covariance", "receivers"),
-    "receivers": ("webhook",),
+    "receivers": (),
     "models": ("matrices",),
 }
 """Names of the core in each kind of section, which no extension may take; commands of the core come before others."""

@@ -2,44 +2,28 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Annotated, Literal, Union
+from functools import reduce
+from operator import or_
+from typing import TYPE_CHECKING, Annotated, Literal
 
 from pydantic import Field, create_model, model_validator
 
 from .extensions import registered, schemas
-from .fields import (
-    Duration,
-    DurationOrZero,
-    EnvironmentName,
-    Number,
-    Positive,
-    Section,
-    Text,
-    Texts,
-    one_of,
-    refused,
-)
-
-Url = Annotated[str, Field(pattern=r"^(https?://\S+|\$[A-Za-z_][A-Za-z0-9_]*)$")]
+from .fields import Duration, DurationOrZero, Number, Positive, Section, Text, Texts, one_of, refused
 
 
-class WebhookSection(Section):
-    """A receiver of alerts: an HTTP server, to which each is sent by POST as JSON."""
+class ReceiverSection(Section):
+    """A receiver of alerts, by the type of an extension."""
 
-    type: Literal["webhook"]
-    """webhook"""
-    url: Url
-    """Address, http or https; or $NAME: the environment variable that holds it."""
-    secret_env: EnvironmentName | None = None
-    """Environment variable with the key of the signature, HMAC-SHA256. Default: none, alerts are not signed."""
-    heartbeat: Duration | None = None
-    """Seconds between two messages that the twin runs, so that the receiver notices when they end. Default: never."""
+    type: Text
+    """Name of the type."""
 
 
 if TYPE_CHECKING:
-    ReceiverSection = WebhookSection
+    Receivers = ReceiverSection
 else:
-    ReceiverSection = Annotated[Union[WebhookSection, *schemas("receivers").values()], Field(discriminator="type")]
+    found = tuple(schemas("receivers").values())
+    Receivers = Annotated[reduce(or_, found), Field(discriminator="type")] if found else ReceiverSection
 
 
 class AlertSection(Section):
@@ -122,5 +106,5 @@ else:
 class OutputsSection(Outputs):
     """Publication of the estimate, and receivers of alerts. Nothing is published by default."""
 
-    receivers: dict[Text, ReceiverSection] = {}
+    receivers: dict[Text, Receivers] = {}
     """Receivers of alerts, by name. Default: none."""

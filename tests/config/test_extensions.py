@@ -118,7 +118,7 @@ def test_names_of_the_core_are_reserved():
     assert {kind: {*names} for kind, names in RESERVED.items()} == {
         "sources": {*SOURCES},
         "outputs": {*OutputsSection.model_fields} - {*registered("outputs")},
-        "receivers": {"webhook"},
+        "receivers": set(),
         "models": {*KINDS} - {*registered("models")},
     }
 

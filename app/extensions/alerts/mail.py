@@ -9,10 +9,11 @@ from email.message import EmailMessage
 from pathlib import Path
 
 from app.engine.outputs.alerts import AlertMessage
-from app.engine.outputs.receivers import TIMEOUT_S, Deadline
+from app.engine.outputs.receivers import TIMEOUT_S
 from app.twin.secrets import Secrets
 
 from .schema import EmailSection
+from .webhook import Deadline
 
 
 class PlainMail(smtplib.SMTP):

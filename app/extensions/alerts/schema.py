@@ -1,12 +1,27 @@
-"""Sections of the YAML: e-mail addresses and programs as receivers of alerts."""
+"""Sections of the YAML: HTTP servers, e-mail addresses and programs as receivers of alerts."""
 
 from __future__ import annotations
 
-from typing import Literal
+from typing import Annotated, Literal
 
-from pydantic import model_validator
+from pydantic import Field, model_validator
 
 from config.fields import Duration, EnvironmentName, Host, Port, Section, Text, Texts, refused
+
+Url = Annotated[str, Field(pattern=r"^(https?://\S+|\$[A-Za-z_][A-Za-z0-9_]*)$")]
+
+
+class WebhookSection(Section):
+    """A receiver of alerts: an HTTP server, to which each is sent by POST as JSON."""
+
+    type: Literal["webhook"]
+    """webhook"""
+    url: Url
+    """Address, http or https; or $NAME: the environment variable that holds it."""
+    secret_env: EnvironmentName | None = None
+    """Environment variable with the key of the signature, HMAC-SHA256. Default: none, alerts are not signed."""
+    heartbeat: Duration | None = None
+    """Seconds between two messages that the twin runs, so that the receiver notices when they end. Default: never."""
 
 
 class EmailSection(Section):

@@ -11,7 +11,6 @@ import pytest
 
 from app.engine.outputs.alerts import heartbeat
 from app.engine.outputs.receivers import Delivery
-from app.extensions.alerts import mail
 from app.extensions.alerts.command import CommandReceiver
 from app.extensions.alerts.mail import Mail
 from app.extensions.alerts.schema import CommandSection, EmailSection
@@ -87,10 +86,7 @@ def test_a_program_has_ended_although_it_leaves_one_running(tmp_path):
         ("tls", b"\x16\x03\x03\x40\x00", 3.0),
     ],
 )
-def test_a_mail_server_that_answers_byte_by_byte_fails_after_the_timeout(
-    monkeypatch, tmp_path, dripping, security, first, late
-):
-    monkeypatch.setattr(mail, "TIMEOUT_S", 0.3)
+def test_a_mail_server_that_answers_byte_by_byte_fails_after_the_timeout(tmp_path, dripping, security, first, late):
     place = {"server": "127.0.0.1", "port": dripping(first, late), "security": security}
     section = EmailSection(type="email", to="ops@plant", sender="nisus@plant", **place)
     with pytest.raises(OSError, match="it has not answered within 0.3 s"):

@@ -3,8 +3,6 @@
 import hashlib
 import hmac
 import sys
-import threading
-from http.server import BaseHTTPRequestHandler, HTTPServer
 from types import SimpleNamespace
 
 import pytest
@@ -13,10 +11,10 @@ from scipy.stats import norm
 from app.engine.copies import AlertMute
 from app.engine.outputs.alerts import AlertRules, heartbeat
 from app.engine.outputs.publisher import Publisher
-from app.engine.outputs.receivers import MAX_WAITING_ALERTS, Delivery, Webhook
+from app.engine.outputs.receivers import MAX_WAITING_ALERTS, Delivery
 from app.engine.outputs.state_message import PublishedState, StateMessage
 from app.twin.twin import load_twin
-from config.output_schema import AlertSection, WebhookSection
+from config.output_schema import AlertSection
 from estimators.diagnostics.episodes import Episode
 from estimators.errors import ConfigError
 from tests.app.engine.outputs.pushed import publishing, push, pushed_twin
@@ -205,13 +203,6 @@ def test_a_receiver_that_failed_gets_what_waited_in_order_and_a_full_queue_drops
     ]
 
 
-@pytest.mark.parametrize("code", [302, 500])
-def test_an_answer_that_is_no_success_counts_as_a_failure_and_is_not_followed(hook, code):
-    hook.code = code
-    with pytest.raises(OSError, match=f"it answers {code}"):
-        Webhook(WebhookSection(type="webhook", url=hook.url)).send(heartbeat("motor", "tracking"))
-
-
 def assert_fails(receiver, reason):
     """An alert waits, is tried again, and the failure is told in one line."""
     delivery, said = delivering(receiver)
@@ -220,41 +211,6 @@ def assert_fails(receiver, reason):
     assert delivery.failing and delivery.waiting == 1
     (line,) = said
     assert reason in line and "\n" not in line
-
-
-class Nonsense(BaseHTTPRequestHandler):
-    """Answers with bytes of no protocol."""
-
-    def do_POST(self):  # noqa: N802
-        self.rfile.read(int(self.headers["Content-Length"]))
-        self.wfile.write(b"nonsense\r\n\r\n")
-
-
-def test_a_receiver_that_answers_nonsense_fails_as_any_other():
-    class Silent:
-        def send(self, alert):
-            raise ConnectionError
-
-    with HTTPServer(("127.0.0.1", 0), Nonsense) as server:
-        threading.Thread(target=server.serve_forever, daemon=True).start()
-        hook = Webhook(WebhookSection(type="webhook", url=f"http://127.0.0.1:{server.server_address[1]}/"))
-        for receiver, reason in ((hook, "nonsense"), (Silent(), "ConnectionError")):
-            assert_fails(receiver, reason)
-        server.shutdown()
-
-
-@pytest.mark.parametrize(
-    ("scheme", "first", "late"),
-    [
-        ("http", b"HTTP/1.1 200 OK\r\nX: ", 0.0),
-        ("https", b"\x16\x03\x03\x40\x00", 0.0),
-        ("https", b"\x16\x03\x03\x40\x00", 3.0),
-    ],
-)
-def test_a_receiver_that_answers_byte_by_byte_fails_after_the_timeout(dripping, scheme, first, late):
-    section = WebhookSection(type="webhook", url=f"{scheme}://127.0.0.1:{dripping(first, late)}/")
-    with pytest.raises(OSError, match="it has not answered within 0.3 s"):
-        Webhook(section).send(heartbeat("motor", "tracking"))
 
 
 def test_a_mute_is_asked_for_by_a_command(serve):
