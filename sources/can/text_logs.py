@@ -34,8 +34,8 @@ CANEDGE = ("timestampepoch", "id", "ide", "buschannel", "datalength", "databytes
 """Columns that are read: time, id, whether it is extended, bus, number of bytes, and the first or all of the bytes."""
 
 CONSOLE = re.compile(
-    r"\s*(?:\((?P<time>[^)]+)\)\s+)?(?P<bus>\S+)\s+(?:[RT]X\s+\S\s+\S\s+)?(?P<id>[0-9A-F]{3}|[0-9A-F]{8})\s+"
-    r"\[(?P<size>\d+)\](?P<data>.*)",
+    r"\s*(?:\((?P<time>\d+\.\d+|\d+-[-\d:. ]+)\)\s+)?(?P<bus>\S+)\s+(?:[RT]X\s+\S\s+\S\s+)?"
+    r"(?P<id>[0-9A-F]{3}|[0-9A-F]{8})\s+\[(?P<size>\d+)\](?P<data>.*)",
     re.IGNORECASE,
 )
 """A line of candump's console output, with the flags of its option -x."""
@@ -172,10 +172,10 @@ class CandumpLines:
     """
 
     def __init__(self, path: Path, lines: list[str], zone: str | None) -> None:
-        found = [match["time"] for line in lines if (match := CONSOLE.fullmatch(_plain(line)))]
+        every = [match["time"] for line in lines if (match := CONSOLE.fullmatch(_plain(line)))]
         self._zone, self._sums, self._t = zone, False, 0.0
         remedy = "record with candump -L"
-        if None in found:
+        if 2 * len(found := [text for text in every if text]) < len(every):  # A line that is damaged may have none.
             raise SourceError(f"{path}: it is console output of candump without times; {remedy}, or with -ta")
         if "-" in found[0] or float(found[0]) > DATED_S:
             return

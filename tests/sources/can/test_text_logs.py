@@ -86,6 +86,16 @@ def test_times_of_candumps_console_output(tmp_path, name, times, seconds):
     assert item == ("can0", 256, 0, pytest.approx(seconds, abs=1e-6))
 
 
+@pytest.mark.parametrize("line", ["(170x000.1)  can0  100   [1]  00", "can0  100   [1]  00", "(17000 can0  100   [1]"])
+def test_a_garbled_first_line_of_candump_loses_only_itself(tmp_path, line):
+    times = ["1700000000.100000", "1700000000.250000"]
+    (tmp_path / "dump.log").write_text(f"{line}\n{lines_of(times)}")
+    (item,), (fault,) = keys_and_times(tmp_path / "dump.log")
+    assert item[3] == pytest.approx([START + 0.1, START + 0.25], abs=1e-6)
+    rule = "1 line cannot be read, the first line 1: it is no line of candump"
+    assert fault == f"dump.log: damaged: {rule}: {' '.join(line.split())}"
+
+
 def test_fields_of_candumps_console_output(tmp_path):
     path = tmp_path / "dump.log"
     rows = CONSOLE.splitlines()
