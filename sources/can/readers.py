@@ -6,6 +6,7 @@ import logging
 import re
 import sqlite3
 import struct
+import zlib
 from collections import Counter
 from collections.abc import Iterator
 from contextlib import suppress
@@ -154,15 +155,16 @@ class _Lines:
 
     def __init__(self, file: TextIOWrapper) -> None:
         file.reconfigure(encoding="utf-8", errors="replace")  # comments may have any encoding
-        self._file, self._line = file, ""
+        self._file, self.line = file, ""
         self._pending: list[str] = []
         self._number = self._bad = 0  # Number of the last line, and lines that could not be read
-        self.fault = ""
+        self.fault, self.whole = "", False
+        """What could not be read, and whether the last frame has all of its bytes."""
 
     @property
     def incomplete(self) -> bool:
         """Whether the last line has no end."""
-        return self._line[-1:] not in ("", "\n")
+        return self.line[-1:] not in ("", "\n")
 
     def __iter__(self) -> _Lines:
         return self
@@ -171,7 +173,7 @@ class _Lines:
         if self._pending:
             return self._pending.pop()
         for line in self._file:
-            self._number, self._line = self._number + 1, line
+            self._number, self.line = self._number + 1, line
             if not (zeros := line.count("\0")):  # python-can skips such a line, or reads what is left of it
                 return line
             self.refuse(f"{zeros} of its bytes are zero")
@@ -180,8 +182,8 @@ class _Lines:
 
     def repeat(self) -> None:
         """Give the last line once more."""
-        if self._line:
-            self._pending.append(self._line)
+        if self.line:
+            self._pending.append(self.line)
 
     def refuse(self, error: object) -> None:
         """Count the last line as unreadable."""
@@ -218,10 +220,10 @@ def _by_lines(path: Path, reader: can.io.MessageReader, lines: _Lines) -> Iterat
                 if suffix_of(path) == ".log" and len(message.data) > message.dlc:
                     lines.refuse("it ends within a byte")
                     continue
-                in_a_row = 0
+                in_a_row, lines.whole = 0, len(message.data) == message.dlc
                 yield message
             return
-        except SourceError:
+        except (SourceError, EOFError, OSError, zlib.error):  # The others are of an archive that is cut or damaged.
             raise
         except Exception as error:  # noqa: BLE001  as above
             lines.refuse(error)
@@ -322,6 +324,8 @@ def _missing_end(path: Path, reader: can.io.MessageReader, lines: _Lines | None)
         page, pages = int.from_bytes(header[16:18], "big"), int.from_bytes(header[28:32], "big")
         size, whole = path.stat().st_size, (65536 if page == 1 else page) * pages
         return f"{size} of {whole} bytes are there" if whole > size else ""
+    if isinstance(reader, can.TRCReader) and lines and lines.whole and re.search(r"\s\w\w\s*$", lines.line):
+        return ""  # with all of its bytes, the last one of two digits
     return "its last line is incomplete" if lines and lines.incomplete else ""
 
 

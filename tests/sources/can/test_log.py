@@ -120,6 +120,25 @@ def test_a_cut_file_gives_what_is_there_and_says_so(tmp_path, messages):
         assert f"{log.frames} frames were read" in reports.texts["truncated file"], suffix
 
 
+def test_a_trc_without_a_line_end_is_complete_if_its_last_byte_is(tmp_path, messages):
+    write(tmp_path / "a.trc", messages)
+    content = (tmp_path / "a.trc").read_text().rstrip()
+    for cut, faults in ((0, 0), (1, 1), (3, 1)):
+        (tmp_path / "b.trc").write_text(content[: len(content) - cut])
+        got, reports = read(tmp_path / "b.trc", decoder_of(tmp_path))
+        assert reports.counts["truncated file"] == faults, reports.texts
+    assert len(got)
+
+
+def test_a_text_log_whose_archive_is_cut_says_so(tmp_path, messages):
+    write(tmp_path / "a.log", messages * 9)
+    content = gzip.compress((tmp_path / "a.log").read_bytes())
+    (tmp_path / "a.log.gz").write_bytes(content[: int(len(content) * 0.7)])
+    text = read(tmp_path / "a.log.gz", decoder_of(tmp_path))[1].texts["truncated file"]
+    told = r"Compressed file ended before the end-of-stream marker was reached after frame (\d+)"
+    assert re.fullmatch(rf"a.log.gz: the file is damaged \({told}\); \1 frames were read", text)
+
+
 def test_a_cut_database_and_archive_say_so(tmp_path, messages):
     write(tmp_path / "a.log", messages)
     with (tmp_path / "a.log").open("rb") as plain, gzip.open(tmp_path / "b.log.gz", "wb") as packed:
