@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+import filecmp
 import os
 import zipfile
 import zlib
 from collections.abc import Callable, Mapping, Sequence
+from contextlib import suppress
 from pathlib import Path
 from typing import BinaryIO, Literal, cast
 
@@ -121,16 +123,21 @@ def is_whole(folder: Path) -> bool:
 
 
 def check_once(files: Sequence[Path], where: str = "") -> None:
-    """Refuse a recording that is named twice, as its measurements would count twice; `where` begins the message.
+    """Refuse a recording that is named twice or copied, as it would count twice; `where` begins the message.
 
     Raises:
         SourceError: Naming it.
     """
     seen: set[Path] = set()
+    alike: dict[tuple[int, bytes], Path] = {}
     for path in files:
         if path.resolve() in seen:
             raise SourceError(f"{where}{path}: is given twice; name each recording once")
         seen.add(path.resolve())
+        with suppress(OSError), path.open("rb") as file:  # Otherwise it is reported when it is read.
+            other = alike.setdefault((path.stat().st_size, file.read(4096)), path)
+            if other is not path and filecmp.cmp(other, path, shallow=False):
+                raise SourceError(f"{where}{path}: has the same content as {other}; leave one out")
 
 
 def check_present(path: Path) -> None:

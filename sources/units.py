@@ -102,16 +102,8 @@ def _unit(text: str) -> pint.Unit:
         text = re.sub(r"\b(degC|degF)\b", r"delta_\1", text)
     try:
         return _registry().Unit(text)
-    except (
-        pint.PintError,
-        ArithmeticError,
-        AttributeError,
-        TypeError,
-        ValueError,
-        SyntaxError,
-        AssertionError,
-    ) as error:
-        raise LookupError(text) from error
+    except (pint.PintError, ArithmeticError, AttributeError, TypeError, ValueError, SyntaxError, AssertionError):
+        raise LookupError(text) from None
 
 
 def _turns(unit: str) -> bool | None:

@@ -23,7 +23,7 @@ import numpy as np
 
 from estimators.errors import SourceError
 
-from ..formats import is_compressed, open_binary
+from ..formats import EXTRAS, is_compressed, open_binary, suffix_of
 from ..source import TRUNCATED
 from ..worker_process import gist, memory_error, memory_limit
 from .text import CHUNK_ROWS, Chunk, Column, Problem, TextCodes, TextMatch, column_of, fill
@@ -39,11 +39,14 @@ MAX_COLUMNS = 1_000_000  # Columns of a NumPy archive, each of which has a name
 
 @contextmanager
 def readable(path: Path, kind: str) -> Iterator[None]:
-    """Turn the errors of a library that reads a damaged file into one line; they have no common base."""
+    """Turn the errors of a library that reads a damaged file, or is not installed, into one line."""
     try:
         yield
     except (SourceError, MemoryError):
         raise
+    except ModuleNotFoundError as error:
+        extra = EXTRAS.get(suffix_of(path))
+        raise SourceError(f"{path}: {kind} needs {error.name}: pip install 'nisus[{extra}]'") from None
     except Exception as error:  # noqa: BLE001
         raise SourceError(f"{path}: it cannot be read as {kind} ({gist(error)}); check that it is complete") from None
 

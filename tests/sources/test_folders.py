@@ -141,3 +141,13 @@ def test_arrow_files_and_streams_are_read(tmp_path, kind):
     path.write_bytes(path.read_bytes()[:2000])
     text = error_of(SourceError, lambda: read_all(table([path])))
     assert text.startswith(f"{path}: it cannot be read as Arrow")
+
+
+def test_a_copy_of_a_file_under_another_name_is_refused(days):
+    if days.suffix == ".zip":
+        return
+    (days / "2024-03-04.csv").write_text((days / "2024-03-02.csv").read_text())
+    said = f"{days / '2024-03-04.csv'}: has the same content as {days / '2024-03-02.csv'}; leave one out"
+    assert error_of(SourceError, inspect_recordings, files_of(days)) == said
+    (days / "2024-03-04.csv").write_text((days / "2024-03-02.csv").read_text().replace("46", "45"))
+    assert inspect_recordings(files_of(days)).t.size == 200

@@ -15,8 +15,6 @@ from sources.tables.dialect import HEAD_BYTES, CsvFormat, Dialect, format_of
 from sources.tables.rows import TableFormat
 from sources.tables.text import CHUNK_ROWS, READ_AS, Chunk, Column, Problem, after_heading, read_text
 
-NEEDS = "a workbook needs python-calamine: pip install 'nisus[excel]'"
-
 
 def sheet_columns(path: Path, time: str, dialect: Dialect) -> list[str]:
     """Return the columns of a sheet; raises SourceError as `_sheet`."""
@@ -49,11 +47,9 @@ def _sheet(path: Path, dialect: Dialect) -> tuple[str, CsvFormat, str]:
     Raises:
         SourceError: If the file cannot be read, there is no such sheet, or none with a table.
     """
-    try:
-        import python_calamine
-    except ModuleNotFoundError:
-        raise SourceError(f"{path}: {NEEDS}") from None
     with readable(path, "a workbook"):
+        import python_calamine
+
         book = python_calamine.load_workbook(content_of(path))
         names = book.sheet_names
     if dialect.sheet is not None and dialect.sheet not in names:

@@ -18,6 +18,7 @@ import numpy as np
 
 from estimators.errors import SourceError
 from sources.formats import is_compressed, suffix_of
+from sources.tables.binary import readable
 from sources.tables.rows import TableFormat
 from sources.tables.text import CHUNK_ROWS, UNREADABLE, Chunk, Column, Problem, column_of
 from sources.worker_process import gist
@@ -182,19 +183,13 @@ def _bag(path: Path) -> Iterator[tuple[dict[str, Declared], Messages]]:
         raise SourceError(f"{path}: {NEEDS}") from None
     if suffix_of(path) == ".mcap":
         with path.open("rb") as file:
-            try:
+            with readable(path, "MCAP"):
                 opened = _indexed(file) or _streamed(path)
-            except Exception as error:  # noqa: BLE001  libraries raise anything
-                text = f"{path}: it cannot be read as MCAP ({gist(error)}); check that it is complete"
-                raise SourceError(text) from None
             yield opened
         return
-    try:
+    with readable(path, "a ROS 2 bag"):
         reader = rosbags.rosbag2.Reader(path)
         reader.open()
-    except Exception as error:  # noqa: BLE001  libraries raise anything
-        text = f"{path}: it cannot be read as a ROS 2 bag ({gist(error)}); check that it is complete"
-        raise SourceError(text) from None
     try:
         there = [one for one in reader.connections if one.msgcount]
         declared = {

@@ -20,8 +20,6 @@ from sources.tables.rows import TableFormat
 from sources.tables.text import CHUNK_ROWS, READ_AS, Chunk, Column, Problem
 from sources.units import heading_unit
 
-NEEDS = "a TDMS file needs npTDMS: pip install 'nisus[tdms]'"
-
 TIME = "time"  # Column of the times of waveforms
 
 
@@ -53,11 +51,9 @@ def _columns(path: Path, time: str, dialect: Dialect) -> tuple[dict[str, np.ndar
     Raises:
         SourceError: If the file cannot be read, there is no such group, or none with numbers.
     """
-    try:
-        from nptdms import TdmsFile
-    except ModuleNotFoundError:
-        raise SourceError(f"{path}: {NEEDS}") from None
     with readable(path, "TDMS"):
+        from nptdms import TdmsFile
+
         file = TdmsFile.read(content_of(path))
     channels: dict[str, list[Any]] = {
         group.name: [one for one in group.channels() if len(one) and one.dtype.kind in "biufM"]

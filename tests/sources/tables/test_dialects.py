@@ -175,7 +175,7 @@ def test_a_summary_names_the_units_and_the_dialect(tmp_path):
 
 
 def test_files_of_one_dialect_are_one_line(tmp_path):
-    paths = [write(tmp_path, "[Data]\n" + HEAD + body(), f"{k}.csv") for k in range(3)]
+    paths = [write(tmp_path, "[Data]\n" + HEAD + body() + "\n" * k, f"{k}.csv") for k in range(3)]
     assert inspect_recordings(paths).faults[0] == "0.csv and 2 more: heading in line 2"
 
 
