@@ -365,13 +365,14 @@ def _tables(files: list[Path], time: TimeColumn, dialect: Dialect) -> RecordingC
             f"{len(other)} columns have another number of rows than {chosen} and are left out: {shown}; name their "
             "own time column to read them"
         )
-    if strange := [name for name in columns if unknown_unit(name)]:
+    form = format_of(files[0])
+    written = form is None or form.cells is not None  # not x[1], a part of an array
+    if strange := [name for name in columns if written and unknown_unit(name)]:
         more = f" and of {len(strange) - 1} more" if len(strange) > 1 else ""
         faults.append(f"the unit of {strange[0]}{more} is not known; give it under `units`")
     times, values, zoneless = [], [], False
     counted: dict[str, list[str]] = {UNDATED: [], TWICE: [], SKIPPED: []}
     order = Order(time.label, time.unit, HORIZON_NS, lambda key, text: None if text in faults else faults.append(text))
-    form = format_of(files[0])
     if form is not None and form.sparse:
         return _sparse(files, time, columns, order, faults)
     for path in files:
