@@ -1,4 +1,4 @@
-"""Several recordings of one asset, merged in order of time."""
+"""Several recordings of one asset, merged in order of time; events from rows and from memory."""
 
 from __future__ import annotations
 
@@ -8,6 +8,7 @@ from typing import Literal
 import numpy as np
 
 from estimators.errors import SourceError
+from estimators.events.batch import COLUMN_TYPES
 from estimators.log import Events
 
 from .source import Recorded, Source, is_endless, span_of
@@ -82,6 +83,18 @@ class Merged(Source):
         """Close them all."""
         for source in self._sources:
             source.close()
+
+
+def batch_of(rows: Sequence[tuple[int, int, int, int, np.ndarray]], width: int) -> Events:
+    """Return rows (t, arrival, kind, channel, values) as events with at least `width` value columns."""
+    if not rows:
+        return Events.empty(width)
+    *columns, values = zip(*rows, strict=True)
+    value = np.full((len(rows), max(width, *(given.size for given in values))), np.nan)
+    for row, given in zip(value, values, strict=True):
+        row[: given.size] = given
+    kinds = zip(columns, COLUMN_TYPES.values(), strict=True)
+    return Events._make([*(np.array(column, kind) for column, kind in kinds), value])
 
 
 BATCH = 4096

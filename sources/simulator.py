@@ -16,6 +16,7 @@ from estimators.numerics.jit import plain
 from estimators.numerics.linalg import wrapped
 
 from .faults.kinds import NEVER_NS, Change
+from .merged import batch_of
 from .source import Source
 
 BATCH_EVENTS = 32  # Events after which `read` returns; a change of the asset affects unread events only
@@ -146,17 +147,7 @@ class Simulator(Source):
                 ) from error
         if not rows:
             return None
-        value = np.full((len(rows), self._model.width), np.nan)
-        for i, (_, _, _, given) in enumerate(rows):
-            value[i, : given.size] = given
-        t = np.array([row[0] for row in rows], np.int64)
-        return Events(
-            t,
-            t.copy(),
-            np.array([row[1] for row in rows], np.int8),
-            np.array([row[2] for row in rows], np.int32),
-            value,
-        )
+        return batch_of([(t, t, kind, channel, given) for t, kind, channel, given in rows], self._model.width)
 
     def _advance(self, rows: list[tuple[int, int, int, np.ndarray]]) -> None:
         """Simulate one step and append its events."""

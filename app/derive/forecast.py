@@ -89,7 +89,9 @@ class Forecasts:
         return here
 
     def compute(self, question: ForecastQuestion) -> JsonObject:
-        """Return the forecast, see `forecast_json`.
+        """Forecast from the present estimate.
+
+        The answer is that of `forecast_json`.
 
         Raises:
             NisusError: If nothing has come yet, the question is too large, or `forecast` refuses it.

@@ -72,9 +72,7 @@ class Feeder:
 
     def stop(self) -> None:
         """Stop reading and close the source."""
-        self._thread.stopping.set()
-        self._room.release()
-        self._thread.stop(2.0)
+        self._thread.stop(2.0, self._room.release)
         try:
             self.source.close()
         except Exception as error:  # noqa: BLE001  as in `_run`; the rest of the twin ends too

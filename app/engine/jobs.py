@@ -285,9 +285,10 @@ class LoopThread(threading.Thread):
         super().__init__(target=run, name=name, daemon=True)
         self.stopping = threading.Event()
 
-    def stop(self, seconds: float | None = None) -> None:
-        """Let the loop end, and wait for that if it was started, no longer than so many seconds."""
+    def stop(self, seconds: float | None = None, wake: Callable[[], object] = lambda: None) -> None:
+        """Let the loop end, which `wake` wakes, and wait for that if it was started, no longer than so many seconds."""
         self.stopping.set()
+        wake()
         if self.is_alive():
             self.join(seconds)
 

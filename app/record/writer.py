@@ -105,9 +105,7 @@ class Recorder:
 
     def stop(self) -> None:
         """Finish the file and end the thread."""
-        self._thread.stopping.set()
-        self.record(None)
-        self._thread.stop(10.0)
+        self._thread.stop(10.0, lambda: self.record(None))
 
     def _run(self) -> None:
         while True:

@@ -64,9 +64,7 @@ class ViserView:
 
     def stop(self) -> None:
         """Stop drawing and the server."""
-        self._thread.stopping.set()
-        self._come.set()
-        self._thread.stop(30.0)
+        self._thread.stop(30.0, self._come.set)
         self._rest()
         with unprinted():
             self.server.stop()

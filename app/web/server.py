@@ -27,7 +27,7 @@ from estimators.errors import ConfigError, EstimatorError, NisusError, reason_of
 from ..charts.colors import EITHER, THEMES
 from ..charts.series import Series
 from ..derive.diagnosis import Diagnosis
-from ..derive.forecast import ForecastQuestion, Forecasts
+from ..derive.forecast import Forecasts
 from ..derive.refits import Refits
 from ..engine.engine import STATUS_PERIOD_S, Engine
 from ..engine.faults import catalogue_json
@@ -172,7 +172,7 @@ class PageServer:
             *self._fit.routes(),
             post("/api/command", self._command, status=202, body_schema=commands_schema),
             get("/api/forecast", self._forecasts.may, refused=409),
-            post("/api/forecast", self._forecast, run=OneAtATime("forecast")),
+            post("/api/forecast", self._forecasts.compute, run=OneAtATime("forecast")),
             get("/api/diagnose", self._diagnosis.figures, refused=503, run=OneAtATime("diagnosis")),
             get("/api/scene", self._scene),
             post("/api/scene", self._choose),
@@ -274,10 +274,6 @@ class PageServer:
         command = command_from_json(body, self._engine)
         self._engine.submit(command)
         return {"submitted": type(command).__name__}
-
-    def _forecast(self, question: ForecastQuestion) -> JsonObject:
-        """Forecast from the present estimate."""
-        return self._forecasts.compute(question)
 
     def _scene(self) -> Response | list[JsonObject]:
         """Return the options of the scene."""

@@ -112,9 +112,8 @@ class Field(Sequence[State]):
             ValueError: If the field has no such cell.
         """
         head, _, rest = name.partition("[")
-        if head != self.name or not rest.endswith("]"):
-            raise ValueError(f"{name!r} is not a cell of {self.name}{list(self.shape)}")
-        cell = tuple(int(part) for part in rest[:-1].split(","))
+        own = head == self.name and rest.endswith("]")
+        cell = tuple(int(part) for part in rest[:-1].split(",")) if own else ()
         if len(cell) != len(self.shape) or not all(0 <= i < n for i, n in zip(cell, self.shape, strict=True)):
             raise ValueError(f"{name!r} is not a cell of {self.name}{list(self.shape)}")
         return int(np.ravel_multi_index(cell, self.shape))

@@ -11,6 +11,7 @@ import numpy as np
 from estimators.log import INPUT, MARK, READING, Events
 from estimators.model.state_space import StateSpaceModel
 
+from ..merged import batch_of
 from .kinds import Fault, find_kind, numbers
 
 
@@ -51,18 +52,7 @@ def items_of(events: Events) -> list[FaultedEvent]:
 
 def events_of(items: Sequence[FaultedEvent], width: int) -> Events:
     """Return events as a batch of at least `width` value columns."""
-    if not items:
-        return Events.empty(width)
-    value = np.full((len(items), max(width, *(item.value.size for item in items))), np.nan)
-    for row, item in zip(value, items, strict=True):
-        row[: item.value.size] = item.value
-    return Events(
-        np.array([item.t for item in items], np.int64),
-        np.array([item.arrival for item in items], np.int64),
-        np.array([item.kind for item in items], np.int8),
-        np.array([item.channel for item in items], np.int32),
-        value,
-    )
+    return batch_of([(item.t, item.arrival, item.kind, item.channel, item.value) for item in items], width)
 
 
 class Target:

@@ -102,10 +102,8 @@ class Publisher:
 
     def stop(self) -> None:
         """Disconnect."""
-        self._thread.stopping.set()
-        self._grown.set()
         self._engine.grown -= {self._awake}
-        self._thread.stop(2.0)
+        self._thread.stop(2.0, self._grown.set)
         self._end()
         self._store.close()
 

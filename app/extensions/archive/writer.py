@@ -61,10 +61,8 @@ class Archive:
 
     def stop(self) -> None:
         """Write the rest of an engine that has stopped, and complete the file."""
-        self._thread.stopping.set()
-        self._grown.set()
         self._engine.grown -= {self._grown.set}
-        self._thread.stop(10.0)
+        self._thread.stop(10.0, self._grown.set)
         self._engine.release(self._cursor)
 
     def _run(self) -> None:

@@ -16,7 +16,7 @@ from estimators.events.clocks import Passed
 from estimators.log import BEFORE, Events
 from sources.merged import MemorySource, Merged
 from sources.pieces import VALUES
-from sources.source import span_of
+from sources.source import Source, span_of
 
 from ..ingest import Ingest
 from .can import CAN_LOG
@@ -24,7 +24,7 @@ from .kind import Kind, Opening, blamed, closed, failure, find_recording, matchi
 
 if TYPE_CHECKING:
     from config.fields import Section
-    from sources.source import Channel, Source
+    from sources.source import Channel
     from sources.tables.dialect import Dialect
     from sources.tables.times import TimeColumn
 
@@ -43,7 +43,7 @@ def _open(opening: Opening) -> Source:
     return Merged([OwnClock(part, Ingest(opening.model, horizon, opening.report)) for part in parts])
 
 
-class OwnClock:
+class OwnClock(Source):
     """Recording with a clock of its own, which is checked and corrected before its events meet those of others.
 
     A clock that was set is known only some events later, so the recording is read to its end first.
@@ -75,10 +75,6 @@ class OwnClock:
             at = np.where(held, events.t, np.maximum.accumulate(np.where(held, BEFORE, events.t)))
             self._checked, self._passed = MemorySource(events.select(np.argsort(at, kind="stable"))), []
         return passed.events.select(slice(0, 0))
-
-    def now(self) -> int | None:
-        """Return None: a recording has no clock."""
-        return None
 
     def close(self) -> None:
         """Close the source."""
