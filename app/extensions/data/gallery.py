@@ -4,9 +4,8 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from concurrent.futures import wait
+from functools import partial
 from pathlib import Path
-
-from starlette.routing import Route
 
 from app.engine.jobs import start_in_thread
 from app.result import JsonObject
@@ -51,11 +50,8 @@ def downloaded(folder: Path, recording: RecordingSet) -> Iterator[str]:
     over.result()
 
 
-def state_route() -> Route:
-    """Return the route of the recordings and the last download."""
-    return get("/api/gallery/data", state)
+state_route = partial(get, "/api/gallery/data", state)
+"""Return the route of the recordings and the last download."""
 
-
-def begin_route() -> Route:
-    """Return the route that begins a download."""
-    return post("/api/gallery/data/get", begin, status=202)
+begin_route = partial(post, "/api/gallery/data/get", begin, status=202)
+"""Return the route that begins a download."""

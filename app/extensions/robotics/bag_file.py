@@ -26,9 +26,9 @@ from estimators.model.state_space import StateSpaceModel
 from estimators.smoothing.walk import Smoothed
 from estimators.track import Track
 
-JOINT_STATE, ARRAY = "sensor_msgs/msg/JointState", "std_msgs/msg/Float64MultiArray"
+from .bag import NEEDS
 
-NEEDS = "needs mcap and rosbags: pip install 'nisus[robotics]'"
+JOINT_STATE, ARRAY = "sensor_msgs/msg/JointState", "std_msgs/msg/Float64MultiArray"
 
 
 def bag_writer(path: Path) -> Callable[..., None]:

@@ -139,7 +139,7 @@ def test_an_estimate_is_written_as_a_bag(tmp_path, nisus):
 def test_packages_are_missed_before_anything_is_folded(tmp_path, nisus, monkeypatch):
     monkeypatch.setitem(sys.modules, "mcap.writer", None)
     said = nisus.refuses("fold", "motor_winding", "--out", tmp_path / "e.mcap")
-    assert said == f"nisus: --out {tmp_path}/e.mcap: needs mcap and rosbags: pip install 'nisus[robotics]'"
+    assert said == f"nisus: --out {tmp_path}/e.mcap: a ROS 2 bag needs mcap and rosbags: pip install 'nisus[robotics]'"
     assert not (tmp_path / "e.mcap").exists()
     said = nisus.refuses("fold", "lorenz63", "--out", "track.txt")
     assert said == "nisus: --out track.txt: must end in .csv, .parquet, .mcap or .rrd"
