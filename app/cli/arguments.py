@@ -105,7 +105,7 @@ class TableOptions:
     time: str | None = None
     """Time column of a table. Default: the column with such a name."""
     time_unit: str = "s"
-    """Unit of the time column: s, ms, us, ns, min or h; excel or matlab for serial dates."""
+    """Unit of the time column: s, ms, us, ns, min, h or d; excel or matlab for serial dates."""
     time_format: str | None = None
     """Format of its dates, for example "%m/%d/%Y %H:%M:%S". Default: detected."""
     time_zone: str | None = None

@@ -3,12 +3,11 @@
 from __future__ import annotations
 
 from pathlib import Path
-from zoneinfo import available_timezones
 
 import numpy as np
 
 from estimators.diagnostics.repeats import find_repeats
-from estimators.errors import ConfigError, nearest, quoted
+from estimators.errors import ConfigError, quoted
 from sources.can.ids import shown_id
 from sources.can.readers import EXTENDED, BusName
 from sources.formats import files_of
@@ -21,20 +20,19 @@ from sources.inspect import (
     is_table,
     quality_conditions,
 )
-from sources.tables.dialect import dialect_of
-from sources.tables.times import SERIAL_DAYS, UNITS, TimeColumn
 
 from ..format_time import FIRST_DATED_NS, duration_text, format_time
 from ..render.text import to_text
 from ..result import Cell, JsonObject, TableColumn, Topic, to_json
 from ..study.advice.draft import undecided_lines
 from ..study.advice.signals import rate_of, signals
+from ..study.log_overview import how_to_read, listed_faults
 from ..terminal import complain
 from .arguments import LogCommand as Arguments
 from .arguments import TableOptions
 from .prepare import attend
 
-MAX_LISTED = 5  # gaps and faults that are listed; the others are counted
+MAX_LISTED = 5  # gaps that are listed; the others are counted
 
 MAX_TEXTS_SHOWN = 8
 
@@ -64,10 +62,8 @@ def show_log(arguments: Arguments) -> int:
 
 def complain_of(found: RecordingContents) -> None:
     """Print what is wrong with a recording, and what was assumed to read it."""
-    for text in found.faults[:MAX_LISTED]:
+    for text in listed_faults(found):
         complain(text)
-    if len(found.faults) > MAX_LISTED:
-        complain(f"and {len(found.faults) - MAX_LISTED} more faults")
 
 
 def contents_of(files: tuple[Path, ...], options: TableOptions) -> RecordingContents:
@@ -79,12 +75,7 @@ def contents_of(files: tuple[Path, ...], options: TableOptions) -> RecordingCont
     """
     if not files:
         raise ConfigError("no recording is named; give at least one")
-    units = [*UNITS, *SERIAL_DAYS]
-    if options.time_unit not in units:
-        raise ConfigError(f"--time-unit {options.time_unit}: is no unit of time; choose from {', '.join(units)}")
-    if options.time_zone is not None and options.time_zone not in available_timezones():
-        remedy = nearest(options.time_zone, available_timezones())
-        raise ConfigError(f"--time-zone {options.time_zone}: is no time zone of this machine; {remedy}")
+    time, dialect = how_to_read(options, "time_", "--")
     files, databases = tuple(one for file in files for one in files_of(file.expanduser())), databases_of(options)
     for path, _ in databases:
         if not path.is_file():
@@ -94,10 +85,8 @@ def contents_of(files: tuple[Path, ...], options: TableOptions) -> RecordingCont
         raise ConfigError(f"--dbc {databases[0][0]}: describes CAN logs, and {files[0]} is a table; leave it out")
     if options.time and tables and not any(tables):
         raise ConfigError(f"--time {quoted(options.time)}: is for tables, and {files[0]} is a CAN log; leave it out")
-    time = TimeColumn(options.time or "", options.time_unit, options.time_format, options.time_zone)
-    how = dialect_of(options.heading, options.delimiter, options.decimal, options.skip, options.sheet, "--")
     more = f" and {len(files) - 1} more" if len(files) > 1 else ""
-    return attend(None, lambda: inspect_recordings(files, databases, time, how), f"reading {files[0].name}{more}")
+    return attend(None, lambda: inspect_recordings(files, databases, time, dialect), f"reading {files[0].name}{more}")
 
 
 def databases_of(options: TableOptions) -> list[tuple[Path, BusName]]:
