@@ -11,32 +11,17 @@ from estimators.errors import ConfigError, quoted
 from sources.can.ids import shown_id
 from sources.can.readers import EXTENDED, BusName
 from sources.formats import files_of
-from sources.inspect import (
-    Message,
-    RecordingContents,
-    SignalSeries,
-    holes,
-    inspect_recordings,
-    is_table,
-    quality_conditions,
-)
+from sources.inspect import Message, RecordingContents, SignalSeries, inspect_recordings, is_table
 
-from ..format_time import FIRST_DATED_NS, duration_text, format_time
+from ..format_time import FIRST_DATED_NS, format_time
 from ..render.text import to_text
 from ..result import Cell, JsonObject, TableColumn, Topic, to_json
-from ..study.advice.draft import undecided_lines
-from ..study.advice.signals import rate_of, signals
-from ..study.log_overview import how_to_read, listed_faults
+from ..study.advice.signals import rate_of
+from ..study.log_overview import duration, facts_of, how_to_read, listed_faults
 from ..terminal import complain
 from .arguments import LogCommand as Arguments
 from .arguments import TableOptions
 from .prepare import attend
-
-MAX_LISTED = 5  # gaps that are listed; the others are counted
-
-MAX_TEXTS_SHOWN = 8
-
-MIN_LONG_NS = 7_200_000_000_000  # Time from which on hours and days are shown
 
 TIMES = (
     "number",
@@ -107,22 +92,10 @@ def _topic(found: RecordingContents) -> Topic:
     name = found.files[0].name + (f" and {len(found.files) - 1} more" if len(found.files) > 1 else "")
     unit = "frames" if found.kind == "can_log" else "rows"
     when = f", from {format_time(start)}" if start >= FIRST_DATED_NS else ""
-    title = f"{name}: {found.t.size} {unit} in {_duration(end - start)}{when}"
-    gaps = [f"{_duration(b - a)} at {_duration(a - start)}" for a, b in found.holes[:MAX_LISTED]]
-    more = f", and {len(found.holes) - MAX_LISTED} more" if len(found.holes) > MAX_LISTED else ""
-    sentences = [f"{len(found.holes)} gaps: {', '.join(gaps)}{more}" if gaps else "no gaps of all signals together"]
-    sentences += _own_gaps(found) + _repeats(found)
+    title = f"{name}: {found.t.size} {unit} in {duration(end - start)}{when}"
     if found.kind == "table":
         rows = tuple((series.name, *_series_cells(series, start)) for series in found.columns)
-        zone = f", local time of {found.time.zone}" if found.time.zone else ""
-        texts = [
-            f"{name}: text: " + ", ".join(f"{text} ({count:,})" for text, count in counts.most_common(MAX_TEXTS_SHOWN))
-            for name, counts in found.texts.items()
-        ]
-        if found.by:
-            texts.append(f"{found.by} names the source of each row; a twin reads them with landmark_column: {found.by}")
-        texts += quality_conditions(found)
-        return Topic(title, (*sentences, f"time: column {found.time.label}{zone}", *texts), ("column", *TIMES), rows)
+        return Topic(title, tuple(facts_of(found)), ("column", *TIMES), rows)
     lines: list[tuple[Cell, ...]] = []
     for message in found.messages:
         bus = "" if message.bus is None else str(message.bus)
@@ -133,43 +106,7 @@ def _topic(found: RecordingContents) -> Topic:
         if empty := len(message.signals) - len(with_values):
             lines.append(("", "", f"  {empty} signals without a value", "", *[None] * len(TIMES)))
     columns = ("bus", "id", "message, signals", "unit", TableColumn("number", absent=""), *TIMES[1:])
-    return Topic(title, tuple(sentences), columns, tuple(lines))
-
-
-def _own_gaps(found: RecordingContents) -> list[str]:
-    """Return the gaps of single messages and columns, and of signals where their flag of validity is 1."""
-    of_all = set(found.holes)
-    named: dict[tuple[tuple[int, int], ...], list[str]] = {}
-    for one in signals(found):
-        series = one.series
-        own = tuple(hole for hole in holes(series.t) if hole not in of_all)
-        if own:
-            name = series.name if one.message is None else f"{one.message}.{series.name}"
-            named.setdefault(own, []).append(name + (f" where {one.valid} is 1" if one.valid else ""))
-    longest = sorted(named, key=lambda own: -max(end - begin for begin, end in own))
-    lines = []
-    for own in longest[:MAX_LISTED]:
-        begin, end = max(own, key=lambda hole: hole[1] - hole[0])
-        others = f" and {len(named[own]) - 1} more" if len(named[own]) > 1 else ""
-        start = int(found.t[0])
-        lines.append(
-            f"{named[own][0]}{others}: {len(own)} gap{'s' * (len(own) > 1)}, the longest {_duration(end - begin)} at "
-            f"{_duration(begin - start)}"
-        )
-    return lines + ([f"and gaps of {len(longest) - MAX_LISTED} more groups of signals"] if longest[MAX_LISTED:] else [])
-
-
-def _repeats(found: RecordingContents) -> list[str]:
-    """Return the signals whose rows repeat or interpolate values, and those of which this cannot be decided."""
-    some = [(one.name, find_repeats(one.series.t, one.series.values)) for one in signals(found) if one.kind == "signal"]
-    lines = [f"{name}: {one.reason}" for name, one in some if one.found]
-    more = [f"and {len(lines) - MAX_LISTED} more signals with repeats"] * (len(lines) > MAX_LISTED)
-    return lines[:MAX_LISTED] + more + undecided_lines(some)
-
-
-def _duration(ns: int) -> str:
-    """Return a time in seconds, and one of hours in hours or days."""
-    return f"{ns * 1e-9:.1f} s" if ns < MIN_LONG_NS else duration_text(ns * 1e-9)
+    return Topic(title, tuple(facts_of(found)), columns, tuple(lines))
 
 
 def _time_cells(t: np.ndarray, start: int) -> tuple[Cell, ...]:

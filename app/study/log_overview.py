@@ -14,21 +14,31 @@ from zoneinfo import available_timezones
 
 import numpy as np
 
+from estimators.diagnostics.repeats import find_repeats
 from estimators.errors import ConfigError, SourceError, nearest
 from sources.can.database import load_database
 from sources.can.ids import KnownIds, shown_id
 from sources.can.readers import BusName
 from sources.formats import files_of
-from sources.inspect import Message, RecordingContents, SignalSeries, inspect_recordings, is_table
+from sources.inspect import (
+    Message,
+    RecordingContents,
+    SignalSeries,
+    holes,
+    inspect_recordings,
+    is_table,
+    quality_conditions,
+)
 from sources.tables.dialect import DETECTED, Dialect, dialect_of
 from sources.tables.rows import names_of
 from sources.tables.times import SERIAL_DAYS, UNITS, TimeColumn
 
+from ..format_time import duration_text
 from ..result import JsonObject
-from .advice.draft import write_draft
+from .advice.draft import undecided_lines, write_draft
 from .advice.draft_fit import DraftStep, fit_plan
 from .advice.plan import OMITTED, SENSOR, STATE, DraftPlan, Roles, SignalRole, plan
-from .advice.signals import rate_of, signal
+from .advice.signals import rate_of, signal, signals
 
 CURVE_BUCKETS = 300
 """Buckets of a curve, each with its lowest and highest value; a shorter series keeps all its values."""
@@ -38,7 +48,9 @@ ALL_BUCKETS = 400_000
 
 MIN_CURVE_BUCKETS = 40
 
-MAX_FAULTS = 5  # Faults of a log that are listed; the others are counted
+MAX_LISTED, MAX_TEXTS_SHOWN = 5, 8  # Gaps and faults, and texts of a column, that are listed; the others are counted
+
+MIN_LONG_NS = 7_200_000_000_000  # Time from which on hours and days are shown
 
 Reading = tuple[TimeColumn, Dialect]
 """How a table is read: its time column, and how it is written."""
@@ -95,12 +107,12 @@ class LogOverview:
     number: int = 0
     start: float = 0.0
     seconds: float = 0.0
-    gaps: int = 0
     ids: int = 0
     signals: list[SignalOverview] = field(default_factory=list)
     frames: list[FrameOverview] = field(default_factory=list)
     databases: list[DatabaseOverview] = field(default_factory=list)
     faults: list[str] = field(default_factory=list)
+    facts: list[str] = field(default_factory=list)
     texts: dict[str, list[str]] = field(default_factory=dict)
     time: str = ""
     unit: str = "s"
@@ -239,10 +251,64 @@ def _database(file: Path, ids: set[int]) -> DatabaseOverview:
     return DatabaseOverview(file, sum(known.find(key) is not None for key in ids))
 
 
+def facts_of(found: RecordingContents) -> list[str]:
+    """Return gaps, repeats, time and texts of a recording in words, a line each."""
+    start = int(found.t[0])
+    gaps = [f"{duration(b - a)} at {duration(a - start)}" for a, b in found.holes[:MAX_LISTED]]
+    more = f", and {len(found.holes) - MAX_LISTED} more" if len(found.holes) > MAX_LISTED else ""
+    lines = [f"{len(found.holes)} gaps: {', '.join(gaps)}{more}" if gaps else "no gaps of all signals together"]
+    lines += _own_gaps(found) + _repeats(found)
+    if found.kind == "table":
+        zone = f", local time of {found.time.zone}" if found.time.zone else ""
+        lines.append(f"time: column {found.time.label}{zone}")
+        lines += [
+            f"{name}: text: {', '.join(f'{text} ({count:,})' for text, count in counts.most_common(MAX_TEXTS_SHOWN))}"
+            for name, counts in found.texts.items()
+        ]
+        if found.by:
+            lines.append(f"{found.by} names the source of each row; a twin reads them with landmark_column: {found.by}")
+        lines += quality_conditions(found)
+    return lines
+
+
+def _own_gaps(found: RecordingContents) -> list[str]:
+    """Return the gaps of single messages and columns, and of signals where their flag of validity is 1."""
+    of_all = set(found.holes)
+    named: dict[tuple[tuple[int, int], ...], list[str]] = {}
+    for one in signals(found):
+        own = tuple(hole for hole in holes(one.series.t) if hole not in of_all)
+        if own:
+            name = one.series.name if one.message is None else f"{one.message}.{one.series.name}"
+            named.setdefault(own, []).append(name + (f" where {one.valid} is 1" if one.valid else ""))
+    longest = sorted(named, key=lambda own: -max(end - begin for begin, end in own))
+    lines = []
+    for own in longest[:MAX_LISTED]:
+        begin, end = max(own, key=lambda hole: hole[1] - hole[0])
+        others = f" and {len(named[own]) - 1} more" if len(named[own]) > 1 else ""
+        lines.append(
+            f"{named[own][0]}{others}: {len(own)} gap{'s' * (len(own) > 1)}, the longest {duration(end - begin)} at "
+            f"{duration(begin - int(found.t[0]))}"
+        )
+    return lines + ([f"and gaps of {len(longest) - MAX_LISTED} more groups of signals"] if longest[MAX_LISTED:] else [])
+
+
+def _repeats(found: RecordingContents) -> list[str]:
+    """Return the signals whose rows repeat or interpolate values, and those of which this cannot be decided."""
+    some = [(one.name, find_repeats(one.series.t, one.series.values)) for one in signals(found) if one.kind == "signal"]
+    lines = [f"{name}: {one.reason}" for name, one in some if one.found]
+    more = [f"and {len(lines) - MAX_LISTED} more signals with repeats"] * (len(lines) > MAX_LISTED)
+    return lines[:MAX_LISTED] + more + undecided_lines(some)
+
+
+def duration(ns: int) -> str:
+    """Return a time in seconds, and one of hours in hours or days."""
+    return f"{ns * 1e-9:.1f} s" if ns < MIN_LONG_NS else duration_text(ns * 1e-9)
+
+
 def listed_faults(found: RecordingContents) -> list[str]:
     """Return what is wrong with a recording, and what was assumed to read it."""
-    more = len(found.faults) - MAX_FAULTS
-    return found.faults[:MAX_FAULTS] + [f"and {more} more faults"] * (more > 0)
+    more = len(found.faults) - MAX_LISTED
+    return found.faults[:MAX_LISTED] + [f"and {more} more faults"] * (more > 0)
 
 
 def _of(
@@ -265,7 +331,7 @@ def _of(
         number=int(found.t.size),
         start=start * 1e-9,
         seconds=(end - start) * 1e-9,
-        gaps=len(found.holes),
+        facts=facts_of(found),
         ids=ids,
         signals=[_signal(group, one) for group, one in kept],
         frames=[_frames(message) for message in found.messages if message.name is None],

@@ -151,15 +151,15 @@ class DroppedLogs:
     def state(self, wanted: LogRequest) -> JsonObject:
         """Return how far the log has been read, its signals, and the twins by how well they fit."""
         path, job = self.read(wanted)
-        running, item = not job.over, job.item  # In this order: once it has ended, its item is the last one.
+        # In this order: once it has ended, its item is the last one.
+        running, item, error = not job.over, job.item, self._words(job.error or "")
         if running and item is None:
             return {"name": path.name, "state": "reading", "seconds": job.elapsed}
         if item is None:
-            return {"name": path.name, "state": "failed", "error": self._words(job.error or "")}
+            return {"name": path.name, "state": "failed", "error": error}
         if job.answer[0] is not item:
             job.answer = item, self._answer(path, item)
-        unproposed = None if job.error is None else self._words(job.error)
-        return {**job.answer[1], "proposing": running, "unproposed": unproposed}
+        return {**job.answer[1], "proposing": running, "unproposed": error}
 
     def _answer(self, path: Path, found: LogOverview) -> JsonObject:
         answer, owners = found.as_json(), self.databases()
@@ -243,8 +243,7 @@ class DroppedLogs:
         Raises:
             ConfigError: If the log has not been read, or there is no such signal.
         """
-        _, job = self.read(wanted)
-        found = job.item
+        found = self.read(wanted)[1].item
         if found is None:
             raise ConfigError(f"{wanted.name}: is still being read; ask again")
         if len(wanted.signals) > MAX_CURVES or not all(0 <= k < len(found.curves) for k in wanted.signals):
@@ -254,10 +253,8 @@ class DroppedLogs:
     def databases(self) -> dict[Path, list[str]]:
         """Return the DBC files in the folder, and those of the twins, with the names of the twins that use them."""
         folder = self._recordings.folder
-        found: dict[Path, list[str]] = {}
-        if folder.is_dir():
-            inside = [path for path in sorted(folder.iterdir()) if path.suffix.lower() == DATABASE]
-            found = {path: [] for path in inside if path.is_file() and not path.is_symlink() and path.name[0] != "."}
+        inside = [path for path in sorted(folder.glob("[!.]*")) if path.suffix.lower() == DATABASE]
+        found: dict[Path, list[str]] = {path: [] for path in inside if path.is_file() and not path.is_symlink()}
         for card, loaded, _ in readable_twins(self._names()):
             section = loaded.config.source
             for key, part in kind_of(section.type).sections(section, KEY).items():

@@ -85,7 +85,7 @@ export class LogView {
     const facts = log.error ? "" : [
       log.kind === "can_log" ? `CAN log, ${count(log.number, "frame")}` : log.number ? `table, ${count(log.number, "row")}` : `table, ${count(log.choices.length, "column")}`,
       log.seconds ? span(log.seconds) : null, log.start > 1e8 ? `from ${new Date(1000 * log.start).toISOString().slice(0, 19).replace("T", " ")} UTC` : null,
-      log.gaps ? count(log.gaps, "gap") : null, log.kind === "can_log" ? count(log.ids, "id") : null, log.time ? `time: ${log.time}` : null,
+      log.kind === "can_log" ? count(log.ids, "id") : null,
     ].filter(Boolean).join(" · ");
     return element("header", { class: "log-head" },
       element("a", { href: "gallery", class: "go" }, "← All twins"), element("h2", {}, log.name), element("p", { class: "faint" }, facts));
@@ -105,6 +105,7 @@ export class LogView {
     const signals = element("section", { class: "log-signals", "aria-label": "Signals" },
       ...log.faults.filter(() => log.needs !== "time").map((text) => element("p", { class: "note-line" }, text)),
       log.kind === "can_log" ? this.databases(log) : this.times(log),
+      ...log.facts.map((text) => element("p", { class: "note-line" }, text)),
       log.signals.length ? this.signals.bar : null,
       this.signals.list,
       log.frames.length ? this.frames(log) : null);

@@ -154,6 +154,25 @@ def test_a_wrong_value_is_refused_as_in_the_terminal(logs, tmp_path, capsys, how
     assert refused.startswith(key) and f"nisus: {option}{refused.removeprefix(key)}\n" == capsys.readouterr().err
 
 
+def test_the_facts_are_those_of_the_terminal(logs, tmp_path, capsys):
+    """Gaps of all and of one, rows that repeat, the zone, words in a column, and what is assumed."""
+    rows = [
+        f"2024-03-05 08:{k // 60:02}:{k % 60:02},{k // 5 * 37 % 101},{'' if 100 < k < 180 else k * k % 53 + 0.25},"
+        f"{'Bad' if k == 7 else 'Good'}\n"
+        for k in range(400)
+        if not 200 < k < 290
+    ]
+    found = read(logs, tmp_path, "time,held,level,quality\n" + "".join(rows), zone="Europe/Berlin")
+    assert main(["log", str(tmp_path / "log.csv"), "--time-zone", "Europe/Berlin"]) == 0
+    title, *lines = map(str.strip, capsys.readouterr().out.splitlines())
+    assert found["facts"] == lines[: len(found["facts"])] and title.startswith("log.csv: 311 rows in 399.0 s, from")
+    assert "1 gaps: 90.0 s at 200.0 s" in found["facts"]
+    assert "level: 1 gap, the longest 80.0 s at 100.0 s" in found["facts"]
+    assert "time: column time, local time of Europe/Berlin" in found["facts"]
+    assert "quality: text: Good (310), Bad (1)" in found["facts"]
+    assert any(line.startswith("held: ") for line in found["facts"])
+
+
 def test_why_no_roles_can_be_proposed_is_said(logs, tmp_path):
     found = read(logs, tmp_path, "t,a\n" + "".join(f"{k},1\n" for k in range(30)))
     assert (found["state"], found["roles"]) == ("ready", None)
