@@ -5,41 +5,23 @@ from __future__ import annotations
 from pathlib import Path
 
 import numpy as np
-from pydantic_core import PydanticCustomError
 
-from config.source_schema import known_zone
 from estimators.diagnostics.repeats import find_repeats
 from estimators.errors import ConfigError, quoted
 from sources.can.ids import shown_id
 from sources.can.readers import EXTENDED, BusName
 from sources.formats import files_of
-from sources.inspect import (
-    Message,
-    RecordingContents,
-    SignalSeries,
-    holes,
-    inspect_recordings,
-    is_table,
-    quality_conditions,
-)
-from sources.tables.dialect import dialect_of
-from sources.tables.times import SERIAL_DAYS, UNITS, TimeColumn
+from sources.inspect import Message, RecordingContents, SignalSeries, inspect_recordings, is_table
 
-from ..format_time import FIRST_DATED_NS, duration_text, format_time
+from ..format_time import FIRST_DATED_NS, format_time
 from ..render.text import to_text
 from ..result import Cell, JsonObject, TableColumn, Topic, to_json
-from ..study.advice.draft import undecided_lines
-from ..study.advice.signals import rate_of, signals
+from ..study.advice.signals import rate_of
+from ..study.log_overview import duration, facts_of, how_to_read, listed_faults
 from ..terminal import complain
 from .arguments import LogCommand as Arguments
 from .arguments import TableOptions
 from .prepare import attend
-
-MAX_LISTED = 5  # gaps and faults that are listed; the others are counted
-
-MAX_TEXTS_SHOWN = 8
-
-MIN_LONG_NS = 7_200_000_000_000  # Time from which on hours and days are shown
 
 TIMES = (
     "number",
@@ -65,10 +47,8 @@ def show_log(arguments: Arguments) -> int:
 
 def complain_of(found: RecordingContents) -> None:
     """Print what is wrong with a recording, and what was assumed to read it."""
-    for text in found.faults[:MAX_LISTED]:
+    for text in listed_faults(found):
         complain(text)
-    if len(found.faults) > MAX_LISTED:
-        complain(f"and {len(found.faults) - MAX_LISTED} more faults")
 
 
 def contents_of(files: tuple[Path, ...], options: TableOptions) -> RecordingContents:
@@ -80,13 +60,7 @@ def contents_of(files: tuple[Path, ...], options: TableOptions) -> RecordingCont
     """
     if not files:
         raise ConfigError("no recording is named; give at least one")
-    units = [*UNITS, *SERIAL_DAYS]
-    if options.time_unit not in units:
-        raise ConfigError(f"--time-unit {options.time_unit}: is no unit of time; choose from {', '.join(units)}")
-    try:
-        zone = options.time_zone and known_zone(options.time_zone)
-    except PydanticCustomError as error:
-        raise ConfigError(f"--time-zone {options.time_zone}: {error.message()}") from None
+    time, dialect = how_to_read(options, "time_", "--")
     files, databases = tuple(one for file in files for one in files_of(file.expanduser())), databases_of(options)
     for path, _ in databases:
         if not path.is_file():
@@ -99,10 +73,8 @@ def contents_of(files: tuple[Path, ...], options: TableOptions) -> RecordingCont
         )
     if options.time and tables and not any(tables):
         raise ConfigError(f"--time {quoted(options.time)}: is for tables, and {files[0]} is a CAN log; leave it out")
-    time = TimeColumn(options.time or "", options.time_unit, options.time_format, zone)
-    how = dialect_of(options.heading, options.delimiter, options.decimal, options.skip, options.sheet, "--")
     more = f" and {len(files) - 1} more" if len(files) > 1 else ""
-    return attend(None, lambda: inspect_recordings(files, databases, time, how), f"reading {files[0].name}{more}")
+    return attend(None, lambda: inspect_recordings(files, databases, time, dialect), f"reading {files[0].name}{more}")
 
 
 def databases_of(options: TableOptions) -> list[tuple[Path, BusName]]:
@@ -123,24 +95,10 @@ def _topic(found: RecordingContents) -> Topic:
     name = found.files[0].name + (f" and {len(found.files) - 1} more" if len(found.files) > 1 else "")
     unit = "frames" if found.kind == "can_log" else "rows"
     when = f", from {format_time(start)}" if start >= FIRST_DATED_NS else ""
-    title = f"{name}: {found.t.size} {unit} in {_duration(end - start)}{when}"
-    gaps = [f"{_duration(b - a)} at {_duration(a - start)}" for a, b in found.holes[:MAX_LISTED]]
-    more = f", and {len(found.holes) - MAX_LISTED} more" if len(found.holes) > MAX_LISTED else ""
-    sentences = [f"{len(found.holes)} gaps: {', '.join(gaps)}{more}" if gaps else "no gaps of all signals together"]
-    sentences += _own_gaps(found) + _repeats(found)
+    title = f"{name}: {found.t.size} {unit} in {duration(end - start)}{when}"
     if found.kind == "table":
         rows = tuple((series.name, series.unit, *_series_cells(series, start)) for series in found.columns)
-        zone = f", local time of {found.time.zone}" if found.time.zone else ""
-        texts = [
-            f"{name}: text: " + ", ".join(f"{text} ({count:,})" for text, count in counts.most_common(MAX_TEXTS_SHOWN))
-            for name, counts in found.texts.items()
-        ]
-        if found.by:
-            texts.append(f"{found.by} names the source of each row; a twin reads them with landmark_column: {found.by}")
-        texts += quality_conditions(found)
-        return Topic(
-            title, (*sentences, f"time: column {found.time.label}{zone}", *texts), ("column", "unit", *TIMES), rows
-        )
+        return Topic(title, tuple(facts_of(found)), ("column", "unit", *TIMES), rows)
     lines: list[tuple[Cell, ...]] = []
     for message in found.messages:
         bus = "" if message.bus is None else str(message.bus)
@@ -151,43 +109,7 @@ def _topic(found: RecordingContents) -> Topic:
         if empty := len(message.signals) - len(with_values):
             lines.append(("", "", f"  {empty} signals without a value", "", *[None] * len(TIMES)))
     columns = ("bus", "id", "message, signals", "unit", TableColumn("number", absent=""), *TIMES[1:])
-    return Topic(title, tuple(sentences), columns, tuple(lines))
-
-
-def _own_gaps(found: RecordingContents) -> list[str]:
-    """Return the gaps of single messages and columns, and of signals where their flag of validity is 1."""
-    of_all = set(found.holes)
-    named: dict[tuple[tuple[int, int], ...], list[str]] = {}
-    for one in signals(found):
-        series = one.series
-        own = tuple(hole for hole in holes(series.t) if hole not in of_all)
-        if own:
-            name = series.name if one.message is None else f"{one.message}.{series.name}"
-            named.setdefault(own, []).append(name + (f" where {one.valid} is 1" if one.valid else ""))
-    longest = sorted(named, key=lambda own: -max(end - begin for begin, end in own))
-    lines = []
-    for own in longest[:MAX_LISTED]:
-        begin, end = max(own, key=lambda hole: hole[1] - hole[0])
-        others = f" and {len(named[own]) - 1} more" if len(named[own]) > 1 else ""
-        start = int(found.t[0])
-        lines.append(
-            f"{named[own][0]}{others}: {len(own)} gap{'s' * (len(own) > 1)}, the longest {_duration(end - begin)} at "
-            f"{_duration(begin - start)}"
-        )
-    return lines + ([f"and gaps of {len(longest) - MAX_LISTED} more groups of signals"] if longest[MAX_LISTED:] else [])
-
-
-def _repeats(found: RecordingContents) -> list[str]:
-    """Return the signals whose rows repeat or interpolate values, and those of which this cannot be decided."""
-    some = [(one.name, find_repeats(one.series.t, one.series.values)) for one in signals(found) if one.kind == "signal"]
-    lines = [f"{name}: {one.reason}" for name, one in some if one.found]
-    more = [f"and {len(lines) - MAX_LISTED} more signals with repeats"] * (len(lines) > MAX_LISTED)
-    return lines[:MAX_LISTED] + more + undecided_lines(some)
-
-
-def _duration(ns: int) -> str:
-    """Return a time in seconds, and one of hours in hours or days."""
-    return f"{ns * 1e-9:.1f} s" if ns < MIN_LONG_NS else duration_text(ns * 1e-9)
+    return Topic(title, tuple(facts_of(found)), columns, tuple(lines))
 
 
 def _time_cells(t: np.ndarray, start: int) -> tuple[Cell, ...]:

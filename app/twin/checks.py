@@ -51,11 +51,11 @@ def check_scene(loaded: Loaded, model: StateSpaceModel) -> None:
         if len(angles) != rows[name]:
             text = f"has {len(angles)} angles; {name} has {rows[name]} rows, give one for each"
             raise loaded.error(("view", "scene", "beams", name), text)
-    known = (*estimated_names(model), *(parameter.name for parameter in model.parameters))
     for name, place in scene.beacons.items():
         at = ("view", "scene", "beacons", name)
         if rows[name] != 1:
             raise loaded.error(at, f"is for one distance; {name} has {rows[name]} rows")
+        known = (*estimated_names(model), *(parameter.name for parameter in model.parameters))
         _check_names(loaded, at, place, known, f"state or parameter of {model.name}")
 
 

@@ -6,20 +6,21 @@ import re
 import threading
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import closing, suppress
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
+from itertools import count
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
 from config.source_schema import CanLogSection, CanSection
-from estimators.errors import ConfigError, SourceError, quoted
-from sources.tables.times import SERIAL_DAYS, UNITS, TimeColumn
+from estimators.errors import ConfigError, SourceError
 from sources.worker_process import IsolatedReader
 
 from ...engine.jobs import CANCELLED, CANCELLING, DONE, FAILED, RUNNING, Job
 from ...result import JsonObject
 from ...study.advice.draft import check_new
 from ...study.advice.draft_fit import DraftStep
-from ...study.log_overview import LogOverview, draft, overview
+from ...study.advice.plan import YAML_NAME
+from ...study.log_overview import LogOverview, draft, how_to_read, overview
 from ...twin.log_match import LogHeader, TwinMatch, match_log
 from ...twin.source import KEY, kind_of
 from ...twin.sources.kind import find_databases
@@ -27,16 +28,19 @@ from ..running import stamp_of
 from .cards import Card, readable_twins
 from .recordings import DATABASE, Recordings
 
-ROLES = ("states", "sensors", "inputs", "held_out")  # Fields of `app.study.advice.plan.Roles`
-
 JOB_TIMEOUT_S = 600.0  # Longest time between two items of a job; the page shows how long it has taken
 
 OPTION_WORDS = {
+    " with --inputs": "", " with --sensors": "", " with --signals": "", " (decimal of the source)": "",
+    "name it with --dbc": "let its name end in .dbc", " with --dbc": "", "with --time-zone": "as Zone",
     "--hold-out ": "held out: ", "--inputs ": "input: ", "--sensors ": "sensor: ", "--states ": "state: ",
-    "--signals ": "signal: ", " with --inputs": "", " with --dbc": "", " with --time-zone": "",
-    " with --time": "", "(--time-unit)": "", "add --time-unit excel": "choose Excel dates",
+    " with --time": "", "--signals ": "signal: ", "--time ": "column ", "add --time-unit": "choose --time-unit",
+    f"nisus advise {YAML_NAME} --apply": "Advice", f"nisus tune {YAML_NAME}": "Tune",
 }  # fmt: skip
-"""Options in messages of the command line, as the page has them."""
+"""Options and commands in messages of the command line, as the page has them; other ones are fields (`FIELD`)."""
+
+FIELD = re.compile(r"(?:(?<=\()[\w.]+, )?--(?:time-)?(unit|format|heading|delimiter|decimal|skip|sheet)")
+"""Option, with its key of a twin, whose field on the page has the same name."""
 
 STOPPED_STATES = {CANCELLING: RUNNING, CANCELLED: "stopped"}  # States of a job whose names on the page differ
 
@@ -47,13 +51,19 @@ MAX_KEPT_LOGS = 2  # Overviews that are kept
 
 @dataclass(frozen=True)
 class LogRequest:
-    """A log, and how to read it: DBC files by name (None: those that fit), time column, its unit and zone."""
+    """A log, and how to read it: DBC files by name (None: those that fit), and the keys of a source."""
 
     name: str
     dbc: tuple[str, ...] | None = None
     time: str | None = None
     unit: str = "s"
+    format: str | None = None
     zone: str | None = None
+    heading: str | None = None
+    delimiter: str | None = None
+    decimal: str | None = None
+    skip: int = 0
+    sheet: str | None = None
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -65,10 +75,10 @@ class CurvesRequest(LogRequest):
 
 @dataclass(frozen=True, kw_only=True)
 class DraftRequest(LogRequest):
-    """Name of a twin to draft from a log, and indices of the signals in each of `ROLES`."""
+    """Name of a twin to draft from a log, and indices of the signals in each of `app.study.advice.plan.Roles`."""
 
     twin: str
-    roles: dict[str, tuple[int, ...]]
+    roles: dict[Literal["states", "sensors", "inputs", "held_out"], tuple[int, ...]]
 
 
 class ReaderJob(Job):
@@ -81,21 +91,12 @@ class ReaderJob(Job):
         *args: object,
         then: Callable[..., None] = lambda item: None,
     ) -> None:
-        """Begin `function(path, *args)`, a generator function, importable by name.
-
-        `then` is called with the last item, in the job's thread.
-        """
+        """Begin `function(path, *args)`, importable by name; `then` gets the last item, in the job's thread."""
         super().__init__(path.name, lambda job: self._read(function, path, args))
         self.item: Any = None
-        self.answer: tuple[object, JsonObject] = (None, {})
-        """The answer of an item, and that item."""
+        self.answer: tuple[object, JsonObject] = (None, {})  # of the item that is first
         self._then = then
         threading.Thread(target=self.run, name="log", daemon=True).start()
-
-    @property
-    def seconds(self) -> float:
-        """Seconds since its start."""
-        return round(self.elapsed, 1)
 
     @property
     def error(self) -> str | None:
@@ -131,17 +132,12 @@ class DroppedLogs:
         """Return the file and the job that reads it, which begins unless it is there; another one ends.
 
         Raises:
-            ConfigError: If there is no such file, or the unit is unknown.
+            ConfigError: If there is no such file, or an option is wrong.
         """
         path = self._recordings.find(wanted.name)
-        if wanted.unit not in (*UNITS, *SERIAL_DAYS):
-            raise ConfigError(
-                f"unit {wanted.unit!r} is no unit of time; choose from {', '.join((*UNITS, *SERIAL_DAYS))}"
-            )
         offered = self.databases()
         given = None if wanted.dbc is None else [self._database(name, offered) for name in wanted.dbc]
-        column = TimeColumn(wanted.time or "", wanted.unit, None, wanted.zone)
-        args = (given, list(offered), column)
+        args = (given, list(offered), how_to_read(wanted))
         key = (str(path), stamp_of((path, *offered)), *map(str, args))
         with self._lock:
             if key not in self._jobs:
@@ -155,33 +151,29 @@ class DroppedLogs:
     def state(self, wanted: LogRequest) -> JsonObject:
         """Return how far the log has been read, its signals, and the twins by how well they fit."""
         path, job = self.read(wanted)
-        running = not job.over  # asked before its item, which is the last one once it has ended
-        if running and job.item is None:
-            return {"name": path.name, "state": "reading", "seconds": job.seconds}
-        item = job.item
+        # In this order: once it has ended, its item is the last one.
+        running, item, error = not job.over, job.item, self._words(job.error or "")
+        if running and item is None:
+            return {"name": path.name, "state": "reading", "seconds": job.elapsed}
         if item is None:
-            return {"name": path.name, "state": "failed", "error": self._words(job.error or "")}
+            return {"name": path.name, "state": "failed", "error": error}
         if job.answer[0] is not item:
             job.answer = item, self._answer(path, item)
-        unproposed = None if job.error is None else self._words(job.error)
-        return {**job.answer[1], "proposing": running, "unproposed": unproposed}
+        return {**job.answer[1], "proposing": running, "unproposed": error}
 
     def _answer(self, path: Path, found: LogOverview) -> JsonObject:
-        answer = found.as_json()
-        owners = self.databases()
+        answer, owners = found.as_json(), self.databases()
         answer["databases"] = [
-            {**asdict(one), "name": _label(Path(one.file), self._recordings.folder), "twins": owners[Path(one.file)]}
+            asdict(one) | {"file": "", "name": _label(one.file, self._recordings.folder), "twins": owners[one.file]}
             for one in found.databases
-            if Path(one.file) in owners and (one.ids or not owners[Path(one.file)])
+            if one.file in owners and (one.ids or not owners[one.file])
         ]
-        for one in answer["databases"]:
-            one["used"] = one["file"] in found.used
         answer["faults"] = [self._words(text) for text in found.faults]
         header = LogHeader(
             found.kind,
             frozenset(found.keys),
             dict.fromkeys(found.choices, "") | {one.name: one.unit for one in found.signals},
-            {name: [text.rpartition(" (")[0] for text in texts] for name, texts in found.texts.items()},
+            found.texts,
             found.time,
         )
         answer["twins"] = [] if found.needs == "time" else self.twins(header)
@@ -200,10 +192,7 @@ class DroppedLogs:
         if self._draft is not None and not self._draft[1].over:
             raise ConfigError(f"{self._draft[0]} is being drafted; wait for it or stop it")
         check_new(wanted.twin, path.parent)
-        unknown = [role for role in wanted.roles if role not in ROLES]
-        if unknown:
-            raise ConfigError(f"role {quoted(unknown[0])} is not known; choose from {', '.join(ROLES)}")
-        named = {}
+        named: dict[str, list[str]] = {}
         for role, indices in wanted.roles.items():
             if not all(0 <= k < len(found.signals) for k in indices):
                 raise ConfigError(f"{role}: give indices below {len(found.signals)}")
@@ -211,8 +200,8 @@ class DroppedLogs:
             named[role] = [f"{one.group}.{one.name}" if found.kind == "can_log" else one.name for one in picked]
         if not named.get("states") and not named.get("sensors"):
             raise ConfigError("no signal is a state or a sensor; give at least one this role")
-        column = TimeColumn(found.time, wanted.unit, None, wanted.zone)
-        args = ([Path(file) for file in found.used], column, wanted.twin, named)
+        how = how_to_read(replace(wanted, time=found.time))
+        args = ([one.file for one in found.databases if one.used], how, wanted.twin, named)
         self._draft = wanted.twin, ReaderJob(draft, path, *args, then=lambda step: self._run(step.file))
         return self.drafting()
 
@@ -224,8 +213,8 @@ class DroppedLogs:
         step: DraftStep = job.item or DraftStep("starting")
         error = None if job.error is None else self._words(job.error)
         state = STOPPED_STATES.get(job.state, job.state)
-        known = {"doing": step.doing, "summary": step.summary}
-        return {"state": state, "twin": twin, "seconds": job.seconds, "error": error, **known}
+        known = {"doing": step.doing, "summary": self._words(step.summary)}
+        return {"state": state, "twin": twin, "seconds": job.elapsed, "error": error, **known}
 
     def stop_draft(self) -> JsonObject:
         """Stop the draft under way; return the progress."""
@@ -238,18 +227,15 @@ class DroppedLogs:
         text = self._recordings.shortened(text)
         for option, words in OPTION_WORDS.items():
             text = text.replace(option, words)
-        return text
+        return FIELD.sub(lambda found: found[1].capitalize(), text)
 
     def _free_name(self, path: Path) -> str:
         """Return a name for a twin of a log that is not taken."""
         stem = re.sub(r"[^A-Za-z0-9_-]+", "_", path.name.partition(".")[0]).strip("_-") or "log"
         stem = stem if stem[0].isalpha() else f"log_{stem}"
         taken = {Path(name).stem for name in self._names()}
-        for k in range(1, 1000):
-            name = stem if k == 1 else f"{stem}-{k}"
-            if name not in taken and not any((path.parent / f"{name}{suffix}").exists() for suffix in (".yaml", ".py")):
-                break
-        return name
+        taken |= {file.stem for ending in ("yaml", "py") for file in path.parent.glob(f"*.{ending}")}
+        return next(name for k in count(1) if (name := stem if k == 1 else f"{stem}-{k}") not in taken)
 
     def curves(self, wanted: CurvesRequest) -> dict[str, list[list[list[float]]]]:
         """Return decimated curves of signals of a log that was read: seconds, lowest and highest values.
@@ -257,8 +243,7 @@ class DroppedLogs:
         Raises:
             ConfigError: If the log has not been read, or there is no such signal.
         """
-        _, job = self.read(wanted)
-        found = job.item
+        found = self.read(wanted)[1].item
         if found is None:
             raise ConfigError(f"{wanted.name}: is still being read; ask again")
         if len(wanted.signals) > MAX_CURVES or not all(0 <= k < len(found.curves) for k in wanted.signals):
@@ -268,10 +253,8 @@ class DroppedLogs:
     def databases(self) -> dict[Path, list[str]]:
         """Return the DBC files in the folder, and those of the twins, with the names of the twins that use them."""
         folder = self._recordings.folder
-        found: dict[Path, list[str]] = {}
-        if folder.is_dir():
-            inside = [path for path in sorted(folder.iterdir()) if path.suffix.lower() == DATABASE]
-            found = {path: [] for path in inside if path.is_file() and not path.is_symlink() and path.name[0] != "."}
+        inside = [path for path in sorted(folder.glob("[!.]*")) if path.suffix.lower() == DATABASE]
+        found: dict[Path, list[str]] = {path: [] for path in inside if path.is_file() and not path.is_symlink()}
         for card, loaded, _ in readable_twins(self._names()):
             section = loaded.config.source
             for key, part in kind_of(section.type).sections(section, KEY).items():
@@ -296,9 +279,8 @@ class DroppedLogs:
 
 
 def _twin_json(match: TwinMatch, card: Card) -> JsonObject:
-    lines = {key: list(getattr(match, key)) for key in ("found", "missing")}
     own = {"name": card.name, "short": Path(card.name).stem, "title": card.title}
-    return {**own, "runs": match.runs, "share": match.share, "blocking": match.blocking, **lines}
+    return own | {"runs": match.runs, "share": match.share} | asdict(match)
 
 
 def _label(path: Path, folder: Path) -> str:

@@ -13,7 +13,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from estimators.errors import ConfigError, NisusError, quoted
-from sources.formats import CAN_LOGS, is_recording, tables
+from sources.formats import CAN_LOGS, EITHER, is_recording, suffix_of, tables
 
 from ...record.rrd_file import Disk
 from ...result import JsonObject
@@ -66,7 +66,7 @@ class Recordings:
             if path.is_symlink() or not path.is_file() or path.name.startswith("."):
                 continue
             database = path.suffix.lower() == DATABASE
-            if log and not database and not is_recording(path.name):
+            if log and not database and not is_log(path.name):
                 continue
             stat = path.stat()
             key = (str(path), stat.st_mtime_ns, stat.st_size)
@@ -159,8 +159,8 @@ class Recordings:
             ConfigError: If the name is invalid, a piece is missing, or the disk is full.
         """
         checked = _checked(name)
-        if Path(checked).suffix.lower() not in (RECORDING, DATABASE) and not is_recording(checked):
-            logs = ", ".join(dict.fromkeys((*CAN_LOGS, *tables())))
+        if Path(checked).suffix.lower() not in (RECORDING, DATABASE) and not is_log(checked):
+            logs = ", ".join(dict.fromkeys((*CAN_LOGS, *EITHER, *tables())))
             raise ConfigError(
                 f"{quoted(checked)}: is neither a recording (.rrd), a log ({logs}, or .csv.gz) nor a "
                 "database (.dbc); export it as one of these"
@@ -195,6 +195,11 @@ class Recordings:
             part.unlink()
             return free.name
         raise ConfigError(f"{name}: there are too many of that name; delete some")
+
+
+def is_log(name: str) -> bool:
+    """Return whether a file of this name can be a log; a text of another folder need not be one, see `is_recording`."""
+    return is_recording(name) or suffix_of(Path(name)) in EITHER
 
 
 def _checked(name: object) -> str:

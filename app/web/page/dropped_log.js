@@ -1,12 +1,21 @@
 // One dropped log: its content and signals, the twins that fit, and a draft of a twin.
 
-import { changed, element, setText, table } from "./dom.js";
+import { changed, element, keepFocus, setText, table } from "./dom.js";
 import { DATABASE } from "./drops.js";
 import { Signals, rate, ROLES } from "./dropped_signals.js";
 import { count, span } from "./format.js";
 import { get, post } from "./http.js";
 
 const POLL_MS = 300;
+
+const UNITS = { s: "seconds", ms: "milliseconds", us: "microseconds", ns: "nanoseconds", min: "minutes", h: "hours", d: "days", excel: "Excel dates", matlab: "MATLAB datenum" };
+
+// How a log is read, as the options of `nisus log`.
+const FIELDS = {
+  Format: "Format of dates, as in strptime: %d.%m.%Y %H:%M:%S", Zone: "Time zone of dates without an offset: Europe/Berlin",
+  Heading: "Line with the names of the columns, or none", Delimiter: "Sign between cells, or tab or space", Decimal: "Decimal sign, . or ,",
+  Skip: "Lines before the table, which are left out", Sheet: "Sheet of a workbook, or group of a TDMS file",
+};
 
 // The view of one log. `ask` has run(log, twin), which starts a twin on it, drop(files), and follow(), which reports how a
 // twin starts.
@@ -16,13 +25,12 @@ export class LogView {
   }
 
   get request() {
-    const { name, dbc, time, unit, zone } = this;
-    return { name, ...(dbc ? { dbc } : {}), ...(time ? { time, unit, zone } : {}) };
+    return { name: this.name, ...this.how };
   }
 
   open(name) {
     if (name === this.name) return;
-    Object.assign(this, { name, dbc: null, time: null, unit: "s", zone: null, log: null, proposed: null, drafts: false });
+    Object.assign(this, { name, how: {}, log: null, proposed: null, drafts: false });
     changed(this.node, null);
     this.node.replaceChildren(element("p", { class: "faint reading", role: "status" }, `${name}: reading …`));
     this.read();
@@ -38,12 +46,14 @@ export class LogView {
   // DBC files were dropped: the log is read again if it is a CAN log.
   describe(files) {
     if (this.log?.kind !== "can_log") return false;
-    this.read({ dbc: [...new Set([...(this.log.databases ?? []).filter((one) => one.used).map((one) => one.name), ...files])] });
+    this.read("dbc", [...new Set([...(this.log.databases ?? []).filter((one) => one.used).map((one) => one.name), ...files])]);
     return true;
   }
 
-  read(change = {}) {
-    Object.assign(this, change, { proposed: null });
+  // Read it, with another value of an option; an empty one leaves it out.
+  read(key, value) {
+    const { [key]: before, ...how } = this.how;
+    Object.assign(this, { how: value ? { ...how, [key]: value } : how, proposed: null });
     this.roles.clear();
     clearTimeout(this.timer);
     this.poll();
@@ -66,7 +76,7 @@ export class LogView {
     if (changed(this.node, { ...log, roles: null, proposing: null, unproposed: null, draft_name: null })) {
       this.signals?.close();
       this.proposed = null;
-      this.node.replaceChildren(this.head(log), ...(log.error ? [this.failure(log)] : [this.body(log)]));
+      keepFocus(this.node, "name", () => this.node.replaceChildren(this.head(log), log.error ? this.failure(log) : this.body(log)));
     }
     this.propose();
   }
@@ -75,7 +85,7 @@ export class LogView {
     const facts = log.error ? "" : [
       log.kind === "can_log" ? `CAN log, ${count(log.number, "frame")}` : log.number ? `table, ${count(log.number, "row")}` : `table, ${count(log.choices.length, "column")}`,
       log.seconds ? span(log.seconds) : null, log.start > 1e8 ? `from ${new Date(1000 * log.start).toISOString().slice(0, 19).replace("T", " ")} UTC` : null,
-      log.gaps ? count(log.gaps, "gap") : null, log.kind === "can_log" ? count(log.ids, "id") : null, log.time ? `time: ${log.time}` : null,
+      log.kind === "can_log" ? count(log.ids, "id") : null,
     ].filter(Boolean).join(" · ");
     return element("header", { class: "log-head" },
       element("a", { href: "gallery", class: "go" }, "← All twins"), element("h2", {}, log.name), element("p", { class: "faint" }, facts));
@@ -86,6 +96,7 @@ export class LogView {
     return element("div", { class: "log-failure" },
       element("p", { class: "banner", role: "alert" }, log.error),
       element("p", {}, "The file is kept in the list of recordings. Correct it and drop it again, drop another one here, or go back to all twins."),
+      this.times(log),
       element("button", { type: "button", class: "go", onclick: () => this.read() }, "Read it again"));
   }
 
@@ -94,6 +105,7 @@ export class LogView {
     const signals = element("section", { class: "log-signals", "aria-label": "Signals" },
       ...log.faults.filter(() => log.needs !== "time").map((text) => element("p", { class: "note-line" }, text)),
       log.kind === "can_log" ? this.databases(log) : this.times(log),
+      ...log.facts.map((text) => element("p", { class: "note-line" }, text)),
       log.signals.length ? this.signals.bar : null,
       this.signals.list,
       log.frames.length ? this.frames(log) : null);
@@ -102,7 +114,7 @@ export class LogView {
 
   // The need of a CAN log, and the databases at hand.
   databases(log) {
-    const toggle = (one) => this.read({ dbc: log.databases.filter((other) => (other === one) !== other.used).map((other) => other.name) });
+    const toggle = (one) => this.read("dbc", log.databases.filter((other) => (other === one) !== other.used).map((other) => other.name));
     const known = log.databases.map((one) => element("li", {},
       element("label", {},
         element("input", { type: "checkbox", checked: one.used, disabled: Boolean(one.error), onchange: () => toggle(one) }), ` ${one.name} `,
@@ -112,23 +124,31 @@ export class LogView {
       element("h2", {}, log.needs === "database" ? "This CAN log needs a DBC" : "Databases"),
       log.needs === "database" ? element("p", {}, `Its ${count(log.number, "frame")} hold raw bytes. A DBC file says which bits are which signal, with scale and unit. Drop the vehicle's .dbc here${known.length ? ", or use one of these:" : ", or choose it."}`) : null,
       known.length ? element("ul", {}, ...known) : null,
-      element("button", { type: "button", class: "go", onclick: () => choose.click() }, "Choose a DBC"), choose);
+      element("button", { type: "button", class: "go", onclick: () => choose.click() }, "Choose a DBC"), choose, this.field("Zone"));
   }
 
-  // Which column holds the time of a table, and its unit.
+  field(label) {
+    const key = label.toLowerCase();
+    const read = ({ target }) => this.read(key, key === "skip" ? Number(target.value) : target.value.trim());
+    return element("label", { title: FIELDS[label] }, `${label} `, element("input", { name: key, type: key === "skip" ? "number" : "text", min: "0", value: this.how[key], placeholder: { zone: "UTC", skip: "0" }[key] ?? "detected", spellcheck: "false", onchange: read }));
+  }
+
+  select(label, key, options, chosen) {
+    return element("label", {}, `${label} `, element("select", { name: key, "aria-label": label, onchange: ({ target }) => this.read(key, target.value) }, ...options.map(([value, text]) => element("option", { value, selected: value === chosen }, text))));
+  }
+
+  // Where the time of a table is, and how it is written.
   times(log) {
-    const option = (value, text, chosen) => element("option", { value, selected: chosen }, text);
-    const column = element("select", { "aria-label": "Time column" }, ...(log.time ? [] : [option("", "choose", true)]), ...log.choices.map((name) => option(name, name, name === log.time)));
-    const units = [["s", "seconds"], ["ms", "milliseconds"], ["us", "microseconds"], ["ns", "nanoseconds"], ["min", "minutes"], ["h", "hours"], ["excel", "Excel dates"], ["matlab", "MATLAB datenum"]];
-    const unit = element("select", { "aria-label": "Unit of the time" }, ...units.map(([value, text]) => option(value, text, value === this.unit)));
-    const change = () => column.value && this.read({ time: column.value, unit: unit.value });
-    column.addEventListener("change", change);
-    unit.addEventListener("change", change);
     const needed = log.needs === "time";
+    const reason = log.error ?? log.faults.join("; ");
+    const formats = [...reason.matchAll(/"(%.*?)"/g)].map(([, format]) => element("button", { type: "button", class: "go", onclick: () => this.read("format", format) }, format));
+    const written = Object.keys(FIELDS).slice(2);
     return element("section", { class: "needs", dataset: { needed: String(needed) } },
-      element("h2", {}, needed ? "Which column holds the time?" : "Time"),
-      needed ? element("p", {}, log.time ? `${log.faults.join("; ")}.` : `No column of ${log.name} has a usual name of a time, or dates. Choose the one with the time of each row; if there is none, add it to the file and drop it again.`) : null,
-      element("p", {}, "Column ", column, " numbers in ", unit, element("span", { class: "faint" }, " (dates are recognised)")));
+      element("h2", {}, needed ? formats.length ? "How is the time written?" : "Which column holds the time?" : "Time"),
+      needed ? element("p", {}, `${reason}. `, ...formats) : null,
+      log.choices ? this.select("Column", "time", [...(log.time ? [] : [["", "detected"]]), ...log.choices.map((name) => [name, name])], log.time) : null,
+      this.select("Unit", "unit", Object.entries(UNITS), log.unit ?? this.how.unit), this.field("Format"), this.field("Zone"),
+      element("details", { open: needed || Boolean(log.error) || written.some((label) => this.how[label.toLowerCase()]) }, element("summary", {}, "How the file is written"), ...written.map((label) => this.field(label))));
   }
 
   frames(log) {
@@ -169,7 +189,7 @@ export class LogView {
 
   drafting(log) {
     const head = element("h2", {}, "Draft a twin from this log");
-    if (!log.signals.length) return element("section", { class: "draft" }, head, element("p", { class: "faint" }, log.needs === "time" ? "Name the time column first." : "Give a DBC first: a draft is made of signals."));
+    if (!log.signals.length) return element("section", { class: "draft" }, head, element("p", { class: "faint" }, log.needs === "time" ? "Complete the fields of the time first." : "Give a DBC first: a draft is made of signals."));
     this.twin = element("input", { type: "text", value: log.draft_name, "aria-label": "Name of the twin", spellcheck: "false" });
     this.chosen = element("p", { class: "chosen", role: "status" }, "finding roles …");
     this.start = element("button", { type: "button", class: "start", disabled: true, onclick: () => this.draft() }, "Draft and run");
@@ -212,7 +232,7 @@ export class LogView {
     this.follow(await post("api/gallery/log/draft", { ...this.request, twin: this.twin.value.trim(), roles }));
   }
 
-  // Progress of the draft, until the session starts the twin.
+  // Progress of the draft, until the session starts the twin; while the session cannot be reached, the last answer.
   follow(answer) {
     this.drafts = answer.state === "running";
     const { doing, seconds, summary } = answer;
@@ -221,12 +241,9 @@ export class LogView {
     this.stop.hidden = !this.drafts;
     this.start.disabled = this.drafts;
     if (answer.state === "done") this.ask.follow();
-    if (this.drafts) setTimeout(() => this.name && this.progressed(answer), POLL_MS);
-  }
-
-  // The next answer; while the session cannot be reached, the last one.
-  async progressed(last) {
-    const found = await get("api/gallery/log/draft");
-    if (this.name) this.follow(found.state ? found : last);
+    if (this.drafts) setTimeout(async () => {
+      const found = this.name && (await get("api/gallery/log/draft"));
+      if (this.name) this.follow(found.state ? found : answer);
+    }, POLL_MS);
   }
 }

@@ -134,9 +134,7 @@ export class Signals {
       for (const index of signals) this.waiting.delete(index);
       const answer = await post("api/gallery/log/curves", { ...this.request, signals });
       if (answer.error) break;
-      signals.forEach((index, k) => {
-        plot(Object.assign(this.rows.get(index), { curve: answer.curves[k] }), this.log);
-      });
+      signals.forEach((index, k) => plot(Object.assign(this.rows.get(index), { curve: answer.curves[k] }), this.log));
     }
     this.asking = false;
   }

@@ -7,11 +7,10 @@ import { get, post } from "./http.js";
 const RECORDING = ".rrd";
 export const DATABASE = ".dbc";
 
-const address = (name) => `gallery#log=${encodeURIComponent(name)}`;
 const ending = (name) => name.slice(name.lastIndexOf(".")).toLowerCase();
 
 // `say` reports progress and errors, `follow` the progress of opening, `show` opens a log where it was dropped.
-export function drops({ say, follow, show = (name) => location.assign(address(name)), described = () => false }) {
+export function drops({ say, follow, show = (name) => location.assign(`gallery#log=${encodeURIComponent(name)}`), described = () => false }) {
   const over = element("div", { class: "drop-here", hidden: true }, element("p", {}, "Drop to open: a recording for review, a log with its signals, a DBC for CAN logs"));
   document.body.append(over);
   let depth = 0;

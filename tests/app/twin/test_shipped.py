@@ -14,6 +14,7 @@ from config.loader import TWINS, shipped
 from estimators.diagnostics.episodes import episodes, episodes_of, judged_rows
 from estimators.fold import fold
 from estimators.log import READING, Log, truth_of
+from estimators.model.parts import Field
 from estimators.track import GATED, USED
 from tests.skips import recorded, with_recording
 from tests.support import SECOND, as_log, read_all
@@ -42,6 +43,14 @@ def test_a_million_cells_fold():
         track = fold(twin.estimator, twin.model, tuning, log)
         assert np.sum(track.verdict == USED) == 2
         assert np.isfinite(track.mean).all() and (track.std > 0).all()
+
+
+def test_a_million_cells_open_without_their_names(monkeypatch):
+    """A name takes 10 µs, and the gallery opens every twin."""
+    made, plain = [], Field.cell_name
+    monkeypatch.setattr(Field, "cell_name", lambda field, k: made.append(k) or plain(field, k))
+    for name in HUGE:
+        assert len(made) <= len(load_twin(name).model.shown) < 100
 
 
 @pytest.fixture(scope="module", params=[name for name in shipped() if name not in HUGE])

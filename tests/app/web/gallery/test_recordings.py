@@ -34,7 +34,7 @@ def folder(tmp_path):
     (folder / "folder.rrd").mkdir()
     (folder / "link.rrd").symlink_to(tmp_path / "private.rrd")
     (folder / "here.rrd").write_bytes(b"RRF2 and so on")
-    (folder / "notes.txt").write_text("not ours")
+    (folder / "notes.md").write_text("not ours")
     return folder
 
 
@@ -52,8 +52,9 @@ def test_nothing_outside_the_folder_can_be_touched(folder, name):
 def test_only_recordings_and_logs_are_listed(folder):
     (folder / "drive.MF4").write_bytes(b"")
     (folder / "drive.asc.gz").write_bytes(b"")
+    (folder / "console.txt").write_bytes(b"")
     assert {entry["name"]: entry["log"] for entry in Recordings(folder).entries()} == {
-        "here.rrd": False, "drive.MF4": True, "drive.asc.gz": True,
+        "here.rrd": False, "drive.MF4": True, "drive.asc.gz": True, "console.txt": True,
     }  # fmt: skip
     assert Recordings(folder / "nowhere").entries() == []
 

@@ -275,8 +275,8 @@ def test_no_error_is_a_dead_end(visit, tmp_path):
         # Its time column is asked for; the answer is all it takes.
         drop(page, "plain.csv", b"a,b\n0,7\n1000,9\n2000,8\n")
         page.get_by_text("Which column holds the time?").wait_for()
-        page.get_by_label("Unit of the time").select_option("ms")
-        page.get_by_label("Time column").select_option("a")
+        page.get_by_label("Unit", exact=True).select_option("ms")
+        page.get_by_label("Column", exact=True).select_option("a")
         assert drawn_range(page, "b") == (9.0, 7.0)
         assert "1 Hz" in row(page, "b").inner_text()
         # Back, all dropped files are there, and open again.
@@ -292,6 +292,33 @@ def test_no_error_is_a_dead_end(visit, tmp_path):
         drop(page, "plain.csv", b"a,b\n0,1\n", "[data-name=motor_bench] h2")
         wait_for(lambda: "there is no column 't_s'" in page.locator("#failed").inner_text())
         assert str(tmp_path) not in page.locator("#failed").inner_text()
+
+
+def test_a_refused_table_is_read_with_what_its_fields_are_given(visit, tmp_path):
+    with opened(tmp_path / "recordings") as session:
+        page = visit(session.session.url, ready=None)
+        page.locator(".card").first.wait_for()
+        drop(page, "us.csv", b"time,v\n" + b"".join(b"03/05/2024 08:0%d:00,%d\n" % (k, k) for k in range(3)))
+        page.locator(".needs").get_by_text("which may be day/month or month/day").wait_for()
+        page.get_by_role("button", name="%m/%d/%Y %H:%M:%S").click()
+        assert drawn_range(page, "v") == (2.0, 0.0)
+        assert "from 2024-03-05 08:00:00 UTC" in page.locator(".log-head").inner_text()
+        assert page.get_by_label("Format", exact=True).input_value() == "%m/%d/%Y %H:%M:%S"
+        # Another log begins with what is detected; one that cannot be read has its fields as well.
+        drop(page, "comma.csv", b"t,a\n" + b"".join(b'%d,"%d,234"\n' % (k, k + 1) for k in range(3)))
+        page.locator(".log-failure [role=alert]").get_by_text(
+            "may be 1234 or 1.234; give Decimal . or Decimal ,"
+        ).wait_for()
+        assert page.get_by_label("Format", exact=True).input_value() == ""
+        decimal = page.get_by_label("Decimal", exact=True)
+        decimal.fill(";")
+        decimal.press("Enter")
+        page.locator(".log-failure [role=alert]").get_by_text("decimal ';': is no decimal sign; give . or ,").wait_for()
+        assert decimal.input_value() == ";"
+        decimal.fill(",")
+        decimal.press("Enter")
+        assert drawn_range(page, "a") == (3.23, 1.23)
+        assert decimal.input_value() == ","
 
 
 def test_a_thousand_channels_are_grouped_searched_and_drawn_as_they_are_seen(visit, tmp_path):
