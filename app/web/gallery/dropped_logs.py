@@ -39,7 +39,7 @@ OPTION_WORDS = {
 }  # fmt: skip
 """Options and commands in messages of the command line, as the page has them; other ones are fields (`FIELD`)."""
 
-FIELD = re.compile(r"(?:(?<=\()[\w.]+, )?--(?:time-)?(unit|format|heading|delimiter|decimal|skip|sheet)")
+FIELD = re.compile(r"(?:(?<=\()[\w.]+, )?--(?:time-)?(unit|zone|format|heading|delimiter|decimal|skip|sheet)")
 """Option, with its key of a twin, whose field on the page has the same name."""
 
 STOPPED_STATES = {CANCELLING: RUNNING, CANCELLED: "stopped"}  # States of a job whose names on the page differ
