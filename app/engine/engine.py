@@ -134,7 +134,7 @@ class Engine(Running):
         self._refold_watchdog = Watchdog(self._give_up, then=REFOLD_REMEDY, long=math.inf)
         self._watching = LoopThread(self._watch, "watchdog")
         self.reloads = 0
-        self._stopping = threading.Event()
+        self._thread = LoopThread(self._run, "engine")
         self._finished = False
         self._idle_ticks = IdleTicks(section.predict_every)
         self._prompt: int | None = None
@@ -149,7 +149,6 @@ class Engine(Running):
         self.store: StateWriter | None = None
         self._telling = threading.Lock()
         self._status = (-np.inf, self._status_now())
-        self._thread = threading.Thread(target=self._run, name="engine", daemon=True)
         if stored is not None:
             self._go_on_from(stored.tail)
             self._watchers.episode_log.restore(stored.episodes)
@@ -196,15 +195,12 @@ class Engine(Running):
 
     def stop(self) -> None:
         """Stop reading and folding."""
-        self._stopping.set()
-        run_all(self._join, self._feeder.stop, self._compile_queue.stop, *(pool.stop for pool in self._pools))
+        self._thread.stopping.set()
+        # It may be in a function that does not return.
+        end = partial(self._thread.stop, 5.0 if self._watchdog.text is None else 0.1)
+        run_all(end, self._feeder.stop, self._compile_queue.stop, *(pool.stop for pool in self._pools))
         self._watchers.episode_log.stop()
         self._watching.stopping.set()
-
-    def _join(self) -> None:
-        """Wait for the batch that is being folded."""
-        if self._thread.is_alive():
-            self._thread.join(timeout=5.0 if self._watchdog.text is None else 0.1)
 
     def settle(self) -> None:
         """Carry out all that waits (events, commands, refolds, jobs) in this thread, for an engine without `start`."""
@@ -337,7 +333,7 @@ class Engine(Running):
     # On the engine's own thread
 
     def _run(self) -> None:
-        while not self._stopping.is_set():
+        while not self._thread.stopping.is_set():
             try:
                 self._round(min(0.05, self._tick))
                 for tell in self.grown:
@@ -419,7 +415,7 @@ class Engine(Running):
 
     def _fold_on(self) -> None:
         """Fold the rest in batches, between which others may read, until the twin is asked for something else."""
-        while self._behind and not self._stopping.is_set():
+        while self._behind and not self._thread.stopping.is_set():
             with self._moving():
                 before = self._fold.n
                 self._batches.advance(self._fold)
@@ -434,7 +430,7 @@ class Engine(Running):
             with self._moving():
                 self._batches.advance(self._fold)
                 self._watchers.alerts.examined(self._fold)
-            if not self._behind or self._stopping.is_set():
+            if not self._behind or self._thread.stopping.is_set():
                 return
 
     def _when_idle(self) -> None:
@@ -465,7 +461,7 @@ class Engine(Running):
     def _finish(self) -> None:
         """The source has ended."""
         self._put(self._intake.finish())
-        while self._behind and not self._stopping.is_set():
+        while self._behind and not self._thread.stopping.is_set():
             self._fold_on()
         with self._moving():
             self._fold.finish()
@@ -544,7 +540,7 @@ class Engine(Running):
         batches, end = BatchSizer(), time.monotonic() + (CATCH_UP_S if hurried else math.inf)
         with self._watchdog.watched(fold):
             while batches.advance(fold):
-                if self._stopping.is_set() or self._submitted or time.monotonic() > end:
+                if self._thread.stopping.is_set() or self._submitted or time.monotonic() > end:
                     break
         return fold.n == self._log.n
 
@@ -607,6 +603,6 @@ class Engine(Running):
                     # The running fold goes on, and the page shows its settings.
                     self.estimator, self.tuning = self._fold.estimator.name, self._fold.tuning
             self._requests.answer(ticket)
-        if again and not self._stopping.is_set():
+        if again and not self._thread.stopping.is_set():
             # The log was cut meanwhile.
             self.retune(self.estimator, self.tuning, self._gesture)

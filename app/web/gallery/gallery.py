@@ -11,7 +11,7 @@ from typing import Protocol
 
 from config.loader import shipped, shown_path
 from config.tunings import OWN_VALUES
-from estimators.errors import ConfigError, NisusError, nearest, quoted
+from estimators.errors import ConfigError, NisusError, nearest, quoted, reason_of
 
 from ...engine.jobs import Job
 from ...twin.changes import obstacle
@@ -132,10 +132,8 @@ class Gallery:
         failed = None
         try:
             self._start(wanted, remark)
-        except NisusError as error:
-            failed = wanted, str(error).splitlines()[0]
         except Exception as error:  # noqa: BLE001  a driver or a user's model may raise anything
-            failed = wanted, f"{type(error).__name__}: {error}"
+            failed = wanted, reason_of(error).splitlines()[0]
         with self._lock:
             self.starting, self.failed = None, failed
             if self.session.running is None:
