@@ -398,6 +398,11 @@ def _tables(files: list[Path], time: TimeColumn, dialect: Dialect) -> RecordingC
         faults.append(f"{where} have no time zone and are taken to be UTC; give one with --time-zone")
     wordy = [name for name, column in zip(columns, v.T, strict=True) if not np.isfinite(column).any()]
     texts = _texts(files, wordy, dialect)
+    for name, counts in texts.items():
+        units = {text.lstrip("+-.,0123456789 ") for text in counts}
+        if len(units) == 1 and not units & set(counts) and heading_unit(f"x [{(unit := units.pop())}]"):
+            remedy = f"write the numbers alone, and {name} [{unit}] in the heading"
+            faults.append(f"{name} has a unit in each cell, such as {quoted(next(iter(counts)))}: {remedy}")
     words = {key: key.removeprefix(NO_VALUE).partition(": ")[0] for key, rows in counted.items() if rows}
     faults += [
         f"{key} (rows: {len(counted[key])}, the first {counted[key][0]})"

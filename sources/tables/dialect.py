@@ -316,10 +316,8 @@ class _Table:
         if decimal == "," and given.decimal is None and (remarks or group or self.delimiter == ","):
             remarks.append("decimal comma")
         if lone:
-            thousands, number = lone.replace(",", ""), float(lone.replace(",", "."))
-            remarks.append(
-                f"{lone} is taken as {number:g}; give --decimal . (decimal of the source) if it is {thousands}"
-            )
+            other = f"give --decimal . (decimal of the source) if it is {lone.replace(',', '')}"
+            remarks.append(f"{lone} is taken as {float(lone.replace(',', '.')):g}; {other}")
         if group:
             remarks.append(f"thousands separator {', '.join(map(repr, group))}")
         if comment:

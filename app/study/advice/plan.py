@@ -205,6 +205,7 @@ def plan(found: RecordingContents, roles: Roles) -> DraftPlan:
             raise ConfigError(f"{part.files[0]}: no message of it is in a DBC; {remedy}")
         if part.kind == "table" and not any(one.values.size for one in part.columns):
             texts = f" (text in {', '.join(part.texts)})" if part.texts else ""
+            texts += "".join(f"; {fault}" for fault in part.faults)
             raise ConfigError(f"{part.files[0]}: no column beside {part.time.name} has numbers{texts}")
         if part.t.size > 1 and part.t[0] == part.t[-1]:
             column = f"if {part.time.name} is not the time, name it with --time; otherwise " * (part.kind == "table")

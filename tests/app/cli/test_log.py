@@ -279,3 +279,12 @@ def test_a_time_zone_may_be_an_offset_which_the_twin_keeps(tmp_path, nisus, zone
     (tmp_path / "made.yaml").write_text((tmp_path / "made.yaml").read_text().replace(written, "+25:00"))
     assert "is no time zone of this machine" in nisus.refuses("fold", str(tmp_path / "made.yaml"))
     assert "--time-zone +25:00: is no time zone" in nisus.refuses("log", options[1], "--time-zone", "+25:00")
+
+
+def test_a_unit_in_each_cell_is_said_with_the_next_step(tmp_path, nisus):
+    rows = "".join(f"{k},{1 + k / 8} kW,{'AB'[k % 2]}\n" for k in range(40))
+    (tmp_path / "a.csv").write_text("t,power,mode\n" + rows)
+    line = "power has a unit in each cell, such as '1.0 kW': write the numbers alone, and power [kW] in the heading"
+    assert nisus("log", str(tmp_path / "a.csv"), "--json").json["faults"] == [line]
+    said = nisus.refuses("new", "made", "--folder", tmp_path, "--log", str(tmp_path / "a.csv"))
+    assert said == f"nisus: {tmp_path / 'a.csv'}: no column beside t has numbers (text in power, mode); {line}"
