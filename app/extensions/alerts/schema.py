@@ -8,15 +8,13 @@ from pydantic import Field, model_validator
 
 from config.fields import Duration, EnvironmentName, Host, Port, Section, Text, Texts, refused
 
-Url = Annotated[str, Field(pattern=r"^(https?://\S+|\$[A-Za-z_][A-Za-z0-9_]*)$")]
-
 
 class WebhookSection(Section):
     """A receiver of alerts: an HTTP server, to which each is sent by POST as JSON."""
 
     type: Literal["webhook"]
     """webhook"""
-    url: Url
+    url: Annotated[str, Field(pattern=r"^(https?://\S+|\$[A-Za-z_][A-Za-z0-9_]*)$")]
     """Address, http or https; or $NAME: the environment variable that holds it."""
     secret_env: EnvironmentName | None = None
     """Environment variable with the key of the signature, HMAC-SHA256. Default: none, alerts are not signed."""

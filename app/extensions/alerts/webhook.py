@@ -119,10 +119,8 @@ class Webhook:
         except Exception as error:
             if deadline.missed(error):
                 raise OSError(f"it has not answered within {TIMEOUT_S:g} s") from None
-            if isinstance(error, URLError):
-                raise OSError(str(error.reason)) from None
-            if isinstance(error, ValueError):  # an address that is none, from the environment
-                raise OSError(str(error)) from None
+            if isinstance(error, URLError | ValueError):  # ValueError: an address that is none, from the environment
+                raise OSError(str(getattr(error, "reason", error))) from None
             raise
         finally:
             deadline.end()
