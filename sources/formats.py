@@ -1,17 +1,17 @@
-"""File formats of recordings, by the ending of the name, and compressed files."""
+"""File formats of recordings, by the ending of the name."""
 
 from __future__ import annotations
 
 import filecmp
 import os
-import zipfile
-import zlib
 from collections.abc import Callable, Mapping, Sequence
 from contextlib import suppress
 from pathlib import Path
-from typing import BinaryIO, Literal, cast
+from typing import Literal
 
 from estimators.errors import SourceError
+
+from .archives import COMPRESSIONS, ZIP, archive_of, is_file, members
 
 CAN_LOGS = (".asc", ".blf", ".csv", ".db", ".log", ".mf4", ".trc")  # Endings of CAN logs
 
@@ -26,11 +26,6 @@ EXTRAS = {
     ".mf4": "mf4", ".mdf": "mf4", ".dat": "mf4",
 }  # fmt: skip
 """Endings of tables that a bundled extension reads, which is named where it is missing."""
-
-ZIP = ".zip"
-
-COMPRESSIONS = (".gz", ".bz2", ".lz4", ".zst")
-"""Endings of compressed files, after that of the format. Of CAN logs, python-can reads `.gz` only."""
 
 
 def added(kind: Literal["tables", "folders"]) -> Mapping[str, Callable]:
@@ -53,36 +48,6 @@ def suffix_of(path: Path) -> str:
     return os.path.splitext(stem)[1] if suffix in COMPRESSIONS else suffix
 
 
-def is_compressed(path: Path) -> bool:
-    """Return whether the file as a whole is compressed, by its ending, or as a part of a ZIP archive."""
-    return path.suffix.lower() in COMPRESSIONS or archive_of(path) is not None
-
-
-def archive_of(path: Path) -> Path | None:
-    """Return the ZIP archive in which a file is, as `export.zip/drive.csv`; None of any other file."""
-    zips = (folder for folder in path.parents if folder.suffix.lower() == ZIP)
-    return next((folder for folder in zips if folder.is_file()), None)
-
-
-def is_file(path: Path) -> bool:
-    """Return whether there is such a file, in a folder or a ZIP archive."""
-    archive = archive_of(path)
-    return path.is_file() if archive is None else path in _members(archive)
-
-
-def _members(archive: Path) -> list[Path]:
-    """Return the files in a ZIP archive.
-
-    Raises:
-        SourceError: If it cannot be read.
-    """
-    try:
-        with zipfile.ZipFile(archive) as file:
-            return sorted(archive / name for name in file.namelist() if not name.endswith("/"))
-    except (OSError, zipfile.BadZipFile) as error:
-        raise SourceError(f"{archive}: it cannot be read as ZIP ({error}); check that it is complete") from None
-
-
 def is_recording(name: str) -> bool:
     """Return whether a file of this name can replace a twin's own recording."""
     return suffix_of(Path(name)) in {*CAN_LOGS, *tables(), ZIP}
@@ -103,7 +68,7 @@ def files_of(path: Path) -> list[Path]:
     if path.is_dir():
         inside = sorted(one for one in path.iterdir() if one.is_file())
     elif path.suffix.lower() == ZIP and path.is_file():
-        inside = _members(path)
+        inside = members(path)
     else:
         return [path]
     found = [one for one in inside if is_recording(one.name) and one.name[0] not in "._"]
@@ -198,20 +163,3 @@ def holds_signals(path: Path) -> bool:
                 return False
             overlap = part[-16:]
     return True
-
-
-UNREADABLE_ERRORS = (OSError, zipfile.BadZipFile, zlib.error, EOFError, NotImplementedError, RuntimeError)
-"""Errors of `open_binary` and of reading such a file: it is damaged, or in an archive with a password."""
-
-
-def open_binary(path: Path) -> BinaryIO:
-    """Open a file for reading; a compressed one is decompressed while it is read, and cannot be seeked."""
-    if (archive := archive_of(path)) is not None:
-        with zipfile.ZipFile(archive) as file:
-            return cast(BinaryIO, file.open(path.relative_to(archive).as_posix()))
-    if not is_compressed(path):
-        return path.open("rb")
-    import pyarrow  # Here, not above: it takes long, and most files are not compressed.
-
-    stream: BinaryIO = pyarrow.input_stream(path, compression="detect")
-    return stream

@@ -15,7 +15,8 @@ import can
 from estimators.errors import SourceError
 from estimators.log import Events
 
-from ..formats import CAN_LOGS, EITHER, archive_of, check_present, is_compressed, suffix_of
+from ..archives import archive_of, is_compressed
+from ..formats import CAN_LOGS, EITHER, check_present, suffix_of
 from ..source import NEVER, TRUNCATED, Recorded, Report, ignore
 from ..units import second_ns
 from ..worker_process import IsolatedReader, read_isolated

@@ -22,8 +22,9 @@ from can.io.generic import TextIOMessageReader
 
 from estimators.errors import SourceError
 
+from ..archives import open_binary
 from ..dates import ns_of_date, ns_of_iso
-from ..formats import open_binary, suffix_of
+from ..formats import suffix_of
 
 HEAD_BYTES = 65_536  # Bytes from which the form of a log is detected
 DATED_S = 1e8  # Times from here on count from 1970

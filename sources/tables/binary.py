@@ -23,7 +23,8 @@ import numpy as np
 
 from estimators.errors import SourceError
 
-from ..formats import EXTRAS, is_compressed, open_binary, suffix_of
+from ..archives import is_compressed, open_binary
+from ..formats import EXTRAS, suffix_of
 from ..source import TRUNCATED
 from ..worker_process import gist, memory_error, memory_limit
 from .text import CHUNK_ROWS, Chunk, Column, Problem, TextCodes, TextMatch, column_of, fill

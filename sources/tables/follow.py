@@ -18,7 +18,8 @@ import numpy as np
 from estimators.errors import SourceError, nearest
 from estimators.log import Events
 
-from ..formats import is_compressed, suffix_of
+from ..archives import is_compressed
+from ..formats import suffix_of
 from ..mapping import ABSENT, PRESENT
 from ..source import NEVER, NO_ASSET, TRUNCATED, AssetEvents, Channel, Numbers, Report, Source, ignore
 from .dialect import DETECTED, HEAD_BYTES, CsvFormat, Dialect, format_of

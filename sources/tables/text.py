@@ -14,7 +14,7 @@ import numpy as np
 
 from estimators.errors import SourceError, quoted
 
-from ..formats import UNREADABLE_ERRORS, open_binary
+from ..archives import UNREADABLE_ERRORS, open_binary
 from ..source import TRUNCATED
 from .dialect import DETECTED, HEAD_BYTES, QUALITY_WORD, CsvFormat, Dialect, format_of
 

@@ -15,8 +15,7 @@ from estimators.errors import ConfigError
 
 from .sets import RecordingSet, find, recordings
 
-REPORT_PERIOD_S = 0.2
-"""Time between two reports of progress."""
+REPORT_PERIOD_S = 0.2  # Time between two reports of progress
 
 jobs: list[ReaderJob] = []
 """The last download of this process, which has one at a time."""

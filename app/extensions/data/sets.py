@@ -17,8 +17,7 @@ from estimators.errors import ConfigError, nearest
 
 SERVER = "https://raw.githubusercontent.com"
 
-MIRROR = "NISUS_MIRROR"
-"""Environment variable with the address of a copy of `SERVER`."""
+MIRROR = "NISUS_MIRROR"  # Environment variable with the address of a copy of `SERVER`
 
 
 @dataclass(frozen=True)

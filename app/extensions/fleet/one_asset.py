@@ -6,7 +6,8 @@ import mmap
 from collections.abc import Iterator, Sequence
 from pathlib import Path
 
-from sources.formats import is_compressed, suffix_of
+from sources.archives import is_compressed
+from sources.formats import suffix_of
 from sources.tables.rows import is_text
 from sources.tables.text import csv_format
 

@@ -17,7 +17,8 @@ from typing import IO, Any
 import numpy as np
 
 from estimators.errors import SourceError
-from sources.formats import is_compressed, suffix_of
+from sources.archives import is_compressed
+from sources.formats import suffix_of
 from sources.tables.binary import readable
 from sources.tables.rows import TableFormat
 from sources.tables.text import CHUNK_ROWS, UNREADABLE, Chunk, Column, Problem, column_of
