@@ -75,6 +75,7 @@ MAX_LEVELS = 8  # Different values up to which a column describes the source, an
 
 HORIZON_NS = 2_000_000_000  # By which a row may be late in a twin, unless its YAML gives another time.max_delay
 
+MIN_ODD_STEP_S = 1000.0  # From one row to the next, of times that do not count from 1970: their unit may be another
 SERIAL_DAYS_SINCE_1970 = (10_957, 47_482)  # Of the years 2000 to 2100
 
 
@@ -348,7 +349,7 @@ def _tables(files: list[Path], time: TimeColumn, dialect: Dialect) -> RecordingC
     time = _with_clock(files[0], names, time._replace(name=chosen), dialect)
     chosen = time.name
     named = TIME_UNITS.get(re.split(r"[\[(/_]", chosen.lower().rstrip(" )]"))[-1].strip())
-    if time.unit == "s" and named is not None:
+    if time.unit == "s" and named is not None and not chosen.lower().endswith("of_day"):
         time = time._replace(unit=named)
     faults = remarks_of(files, dialect)
     copies = [name for name, count in Counter(names).items() if count > 1]
@@ -383,19 +384,19 @@ def _tables(files: list[Path], time: TimeColumn, dialect: Dialect) -> RecordingC
             order.check(path.name, rows.line[rows.known], times[-1])
     undated = counted.pop(UNDATED)
     if not any(part.size for part in times):
-        none = (
-            f"no row has a time; {undated[0]}"
-            if undated
-            else f"{files[0]}: it has a header and no rows; record it again"
-        )
-        raise SourceError("; ".join([*faults, none] if undated else faults or [none]))
+        if undated:
+            raise SourceError("; ".join([*faults, f"no row has a time; {undated[0]}"]))
+        raise SourceError("; ".join(faults) or f"{files[0]}: it has a header and no rows; record it again")
     if undated:
         more = f"; so are {len(undated) - 1} more rows" if len(undated) > 1 else ""
         faults.append(undated[0] + more)
     t, v = np.concatenate(times), np.concatenate(values)
     if zoneless and t[-1] > DATED_S * 1e9:
-        where = f"{files[0].name}: its dates"
-        faults.append(f"{where} have no time zone and are taken to be UTC; give one with --time-zone")
+        rule = "its dates have no time zone and are taken to be UTC; give one with --time-zone"
+        faults.append(f"{files[0].name}: {rule}")
+    step = float(np.median(np.abs(np.diff(t)))) * 1e-9 if t.size > 1 else 0.0
+    if time.unit == "s" and step >= MIN_ODD_STEP_S and t[0] < EPOCH_S[0] * 1e9 and not zoneless:
+        faults.append(f"{chosen} grows by {step:g} a row, taken as s; if that is ms, us or ns, give --time-unit")
     wordy = [name for name, column in zip(columns, v.T, strict=True) if not np.isfinite(column).any()]
     texts = _texts(files, wordy, dialect)
     for name, counts in texts.items():
@@ -517,6 +518,9 @@ def _rows(
                         counted.setdefault(key, []).append(f"{path.name}:{line}")
                     elif key != UNREADABLE:
                         counted.get(key, faults).append(f"{path.name}:{line}: {text}")
+                    elif (name := text.partition(" is ")[0]) in columns:
+                        seen = counted.setdefault(f"{name}: no number", [])
+                        seen.append("" if seen else f"{path.name}:{line}: {text}")
                 yield rows
     except SourceError as error:
         faults.append(str(error))
@@ -527,7 +531,9 @@ def _time_of(path: Path, names: Sequence[str], time: TimeColumn, dialect: Dialec
 
     Dates that stay the same, such as the begin and end of a query, are taken only if there are no others.
     """
-    able = [name for name in names if (heading_unit(name) or "s").lower() in TIME_UNITS]  # T [°C] is none.
+    able = [
+        name for name in names if name != "T" and (heading_unit(name) or "s").lower() in TIME_UNITS
+    ]  # T [°C] is none.
     last = {_bare(name): name for name in reversed(able)}
     named = next((last[name] for name in TIME_NAMES if name in last), None)
     like = next((name for name in able if TIME_NAME.search(name)), None)

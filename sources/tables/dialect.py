@@ -20,6 +20,8 @@ from ..units import heading_unit
 
 HEAD_BYTES = 65_536  # Bytes from which the format of a CSV is detected
 DELIMITERS = ",;\t| "
+csv.field_size_limit(2**31 - 1)  # A line is cut before it is that long.
+
 SAMPLE_LINES = 100  # Last lines of the head, which show the delimiter and the number of columns
 MIN_SHARE = 0.2  # Of the last lines that are rows of a table without a heading
 MAX_CELL_LINES = 8  # Lines of a cell with line breaks

@@ -32,11 +32,13 @@ SERIAL_DAYS = {"excel": 25_569, "matlab": 719_529}
 MAX_TIME_NS = 2**62
 """Distance (146 years) of a time from 0; numbers beyond it are of another unit, or no times."""
 
-EPOCH_S = (631_152_000, 2_840_140_800)  # 1990 and 2060
+EPOCH_S = (946_684_800, 2_840_140_800)  # 2000 and 2060
 LABVIEW_S = 2_082_844_800  # From 1904-01-01, where LabVIEW counts from, to 1970
 _COMPACT = re.compile(r"(?:19|20)\d{10}(?:\d\d(?:\d{3})?)?")  # 20240315080000, with or without seconds and milliseconds
 _WHOLE_DAY = re.compile(r"(?:19|20)\d\d(?:0[1-9]|1[0-2])(?:0[1-9]|[12]\d|3[01])")  # 20240315
 WHOLE_CLOCK = re.compile(r"(?:[01]\d|2[0-3])[0-5]\d[0-5]\d(?:\.\d*)?")  # 080010
+
+_DATE_NAME = re.compile("dat(e|um)", re.IGNORECASE)  # 150324 is no clock there.
 
 _NAMED_DAY = re.compile(r"(?<!\d)((?:19|20)\d\d)([-_.]?)(0[1-9]|1[0-2])\2(0[1-9]|[12]\d|3[01])(?!\d)")
 """A date in the name of a file."""
@@ -86,7 +88,7 @@ class TimeReader:
 
     A clock without a date begins at the column's `date`, or that in the name of the file `path`, and passes midnight
     when it goes back by more than an hour. Without a file, it is no time. Numbers that are too large for seconds are of
-    the unit in which the first one is a time between 1990 and 2060; those that all spell a date (20240315) or a clock
+    the unit in which the first one is a time between 2000 and 2060; those that all spell a date (20240315) or a clock
     (080010) are read so. `notes` are rows of the last chunk whose time was assumed: row, key, text. `zoneless` tells
     whether there was a date without a time zone.
 
@@ -212,7 +214,12 @@ class TimeReader:
         if cells and all(_WHOLE_DAY.fullmatch(cell) and ns_of_date(cell, False) for cell in cells):
             self._spelt = "day"
             self.notes.append((0, ASSUMED, f"{self._column.label} is {cells[0]}, taken as a date"))
-        elif cells and self._midnight is not None and all(WHOLE_CLOCK.fullmatch(_padded(cell)) for cell in cells):
+        elif (
+            cells
+            and self._midnight is not None
+            and not _DATE_NAME.search(self._column.label)
+            and all(WHOLE_CLOCK.fullmatch(_padded(cell)) for cell in cells)
+        ):
             numbers = np.array(cells, float)
             seconds = numbers - 40.0 * (numbers // 100) - 2400.0 * (numbers // 10_000)
             steps, clocks = np.diff(numbers), np.diff(seconds)
@@ -358,7 +365,7 @@ def _day_and_month(name: str, cells: Sequence[str]) -> str:
         firsts, lasts = ({one[k] for one in short} for k in (0, 2))
         if len(lasts) > len(firsts) or max(firsts) > "31":  # The day changes more often than the year.
             return "year"
-        if len(lasts) == len(firsts) and max(firsts) > "12":
+        if len(lasts) == len(firsts) and max(firsts) > "12" and firsts != lasts:
             unclear, words = next(filter(_SHORT.match, cells)), ("year-month-day", "day-month-year")
     for cell in cells[: 0 if unclear else MAX_DETECTION_CELLS]:
         found = layout(cell)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import random
+import re
 from datetime import UTC, datetime, timedelta
 from pathlib import Path
 
@@ -191,9 +192,49 @@ def test_serial_dates_that_are_read_as_seconds_are_named(tmp_path, unit, day):
     assert found.faults == [zone] and found.t[0] == pytest.approx(MOMENT_NS, abs=10**6)
 
 
-def test_the_months_of_a_two_digit_year_are_told_by_its_formats():
-    from estimators.errors import SourceError
+def columns_of(tmp_path, heading, row, name="log.csv"):
+    """Return what is read of 60 rows, each `row(k)`."""
+    (tmp_path / name).write_text(f"{heading}\n" + "".join(f"{row(k)}\n" for k in range(60)))
+    return inspect_recordings([tmp_path / name])
 
+
+def test_steps_that_are_too_long_for_seconds_are_said(tmp_path):
+    line = "timestamp grows by 20000 a row, taken as s; if that is ms, us or ns, give --time-unit"
+    assert columns_of(tmp_path, "timestamp,x", lambda k: f"{k * 20_000},{k % 7}").faults == [line]
+    assert columns_of(tmp_path, "timestamp,x", lambda k: f"{1_710_489_600 + k * 20_000},{k % 7}").faults == []
+    assert columns_of(tmp_path, "timestamp,x", lambda k: f"{k * 20},{k % 7}").faults == []
+
+
+def test_values_that_are_no_numbers_are_counted(tmp_path):
+    found = columns_of(tmp_path, "t,dT", lambda k: f"{k},{'−' if k % 3 == 0 else ''}{k}.5")
+    why = "dT is '−0.5', which is not a number; the value is missing"
+    assert found.faults == [f"dT: no number (rows: 20, the first log.csv:2: {why})"]
+
+
+def test_a_temperature_is_no_time_and_a_date_in_two_digits_no_clock(tmp_path):
+    with pytest.raises(SourceError, match="which column holds the time is not known; name it with --time, one of n, T"):
+        columns_of(tmp_path, "n,T,U", lambda k: f"{k},{20 + k},{k % 7}")
+    found = columns_of(tmp_path, "Date,x", lambda k: f"0503{24 + k // 40},{k % 7}")
+    assert found.t.tolist() == [(50_324 + k // 40) * 10**9 for k in range(60)]
+
+
+def test_ticks_of_dotnet_are_no_time_since_1970():
+    assert read("638452441310000000") == [None]
+
+
+def test_years_of_two_digits_may_be_days():
+    forms = '"%y-%m-%d %H:%M" or "%d-%m-%y %H:%M"'
+    with pytest.raises(SourceError, match=re.escape(forms)):
+        read("24-03-05 08:00")
+    assert read("24-03-24 08:00") == [MOMENT_NS + 9 * 86_400 * 10**9]  # the same in either order
+
+
+def test_a_cell_may_be_long(tmp_path):
+    found = columns_of(tmp_path, "t,x,text", lambda k: f"{k},{k % 7},{'a' * 200_000 if k == 30 else 'b'}")
+    assert found.columns[0].values.tolist() == [k % 7 for k in range(60)]
+
+
+def test_the_months_of_a_two_digit_year_are_told_by_its_formats():
     with pytest.raises(SourceError, match='"%d/%m/%y %H:%M" or "%m/%d/%y %H:%M"'):
         read("3/4/24 8:00")
     assert read("3/4/24 8:00", format="%m/%d/%y %H:%M") == [1_709_539_200 * 10**9]
@@ -208,8 +249,6 @@ def test_the_months_of_a_two_digit_year_are_told_by_its_formats():
     ],
 )
 def test_the_formats_that_are_offered_read_the_cell(cell, form):
-    from estimators.errors import SourceError
-
     with pytest.raises(SourceError, match=f'"{form}" or '):
         read(cell)
     assert read(cell, format=form) != [None]
