@@ -191,7 +191,8 @@ def report_draft(draft: Draft, json: bool) -> None:
             "\n"
             + "\n".join(shorten(line, MAX_OMISSION_TEXT, placeholder=" ... (the YAML lists all)") for line in omitted)
         )
-    print(f"\nNext: nisus run {written[0]}")
+    if check is not None:
+        print(f"\nNext: nisus run {written[0]}")
 
 
 def write_twin(name: str, folder: Path) -> tuple[Path, Path]:
