@@ -75,6 +75,7 @@ MAX_LEVELS = 8  # Different values up to which a column describes the source, an
 
 HORIZON_NS = 2_000_000_000  # By which a row may be late in a twin, unless its YAML gives another time.max_delay
 
+CODE_DISTANCE = 3.0  # Of a code from all values, in ranges of these
 MIN_ODD_STEP_S = 1000.0  # From one row to the next, of times that do not count from 1970: their unit may be another
 SERIAL_DAYS_SINCE_1970 = (10_957, 47_482)  # Of the years 2000 to 2100
 
@@ -417,7 +418,9 @@ def _tables(files: list[Path], time: TimeColumn, dialect: Dialect) -> RecordingC
     found = []
     for name, column in zip(columns, v.T, strict=True):
         one = _series(name, heading_unit(name) or suffix_unit(name), t, column)
-        split = name != by and labels and np.unique(one.values).size > MAX_LEVELS
+        levels, count = np.unique(one.values, return_counts=True)
+        faults += _codes(name, levels, count)
+        split = name != by and labels and levels.size > MAX_LEVELS
         found += _split(one, by, labels, t, column, source) if split else [one]
     for unit, origin in SERIAL_DAYS.items() if time.unit == "s" and t[-1] - t[0] < 0.5e9 * t.size else ():
         low, high = ((origin + days) * 10**9 for days in SERIAL_DAYS_SINCE_1970)
@@ -426,6 +429,15 @@ def _tables(files: list[Path], time: TimeColumn, dialect: Dialect) -> RecordingC
     return RecordingContents(
         files, "table", t, columns=found, time=time, faults=faults, texts=texts, by=by, dialect=dialect
     )
+
+
+def _codes(name: str, levels: np.ndarray, count: np.ndarray) -> Iterator[str]:
+    """Yield that the lowest or the highest value of a column may stand for a missing one, as -999 does."""
+    for k, others in ((0, levels[1:]), (-1, levels[:-1])) if levels.size > MAX_LEVELS else ():
+        if count[k] > 2 and np.abs(others - levels[k]).min() > CODE_DISTANCE * np.ptp(others):
+            low, high = others[0] - np.ptp(others), others[-1] + np.ptp(others)
+            rule = f"if that is a missing value, set {name}: [{low:.4g}, {high:.4g}] in valid_if of its sensor"
+            yield f"{name} is {levels[k]:g} in {count[k]:,} rows, far from all other values; {rule}"
 
 
 def _sparse(
@@ -531,9 +543,8 @@ def _time_of(path: Path, names: Sequence[str], time: TimeColumn, dialect: Dialec
 
     Dates that stay the same, such as the begin and end of a query, are taken only if there are no others.
     """
-    able = [
-        name for name in names if name != "T" and (heading_unit(name) or "s").lower() in TIME_UNITS
-    ]  # T [°C] is none.
+    # T is a temperature more often, as is T [°C].
+    able = [name for name in names if name != "T" and (heading_unit(name) or "s").lower() in TIME_UNITS]
     last = {_bare(name): name for name in reversed(able)}
     named = next((last[name] for name in TIME_NAMES if name in last), None)
     like = next((name for name in able if TIME_NAME.search(name)), None)

@@ -194,20 +194,9 @@ def _draft_json(every: list[Signal], drafted: DraftPlan) -> JsonObject:
     names = [one.name for one in drafted.signals]
     return {
         "signals": [
-            {
-                "name": one.name,
-                "message": one.message,
-                "unit": one.series.unit,
-                "number": int(one.series.values.size),
-                "rate": one.rate,
-                "holes": one.holes,
-                "longest_gap": one.longest,
-                "levels": one.levels,
-                "step": one.resolution,
-                "noise": one.noise,
-                "kind": one.kind,
-                "wraps": one.wraps,
-            }
+            {key: getattr(one, key) for key in ("name", "message", "rate", "holes", "levels", "noise", "kind", "wraps")}
+            | {"unit": one.series.unit, "number": one.series.values.size}
+            | {"longest_gap": one.longest, "step": one.resolution}
             for one in every
         ],
         "pairs": [

@@ -211,6 +211,12 @@ def test_values_that_are_no_numbers_are_counted(tmp_path):
     assert found.faults == [f"dT: no number (rows: 20, the first log.csv:2: {why})"]
 
 
+def test_a_code_far_from_all_values_is_said(tmp_path):
+    found = columns_of(tmp_path, "t,a,b,c", lambda k: f"{k},{-999 if k % 20 == 3 else k},{k},{1e9 if k == 5 else k}")
+    rule = "if that is a missing value, set a: [-59, 118] in valid_if of its sensor"
+    assert found.faults == [f"a is -999 in 3 rows, far from all other values; {rule}"]
+
+
 def test_a_temperature_is_no_time_and_a_date_in_two_digits_no_clock(tmp_path):
     with pytest.raises(SourceError, match="which column holds the time is not known; name it with --time, one of n, T"):
         columns_of(tmp_path, "n,T,U", lambda k: f"{k},{20 + k},{k % 7}")
