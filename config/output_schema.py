@@ -12,7 +12,7 @@ from .extensions import registered, schemas
 from .fields import Duration, DurationOrZero, Number, Positive, Section, Text, Texts, one_of, refused
 
 
-class ReceiverSection(Section):
+class AnyReceiver(Section):
     """A receiver of alerts, by the type of an extension."""
 
     type: Text
@@ -20,10 +20,10 @@ class ReceiverSection(Section):
 
 
 if TYPE_CHECKING:
-    Receivers = ReceiverSection
+    ReceiverSection = AnyReceiver
 else:
     found = tuple(schemas("receivers").values())
-    Receivers = Annotated[reduce(or_, found), Field(discriminator="type")] if found else ReceiverSection
+    ReceiverSection = Annotated[reduce(or_, found), Field(discriminator="type")] if found else AnyReceiver
 
 
 class AlertSection(Section):
@@ -106,5 +106,5 @@ else:
 class OutputsSection(Outputs):
     """Publication of the estimate, and receivers of alerts. Nothing is published by default."""
 
-    receivers: dict[Text, Receivers] = {}
+    receivers: dict[Text, ReceiverSection] = {}
     """Receivers of alerts, by name. Default: none."""

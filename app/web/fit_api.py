@@ -56,7 +56,7 @@ class FitApi:
             return {"state": "none"} | available
         return _attempt_json(attempt) | available | {"current": engine.folded_with()[0] is attempt.tuning}
 
-    def _begin(self, wanted: list[str], events: int | None = None) -> JsonObject:
+    def _begin(self, wanted: tuple[str, ...], events: int | None = None) -> JsonObject:
         """Fit the entries `wanted`, such as Q or R.winding, to the last `events`; None is all."""
         if events is not None and events < 1:
             raise ConfigError(f"fit: events is {events}; it must be a positive whole number, or be left out for all")

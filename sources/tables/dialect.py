@@ -20,8 +20,6 @@ from ..units import heading_unit
 
 HEAD_BYTES = 65_536  # Bytes from which the format of a CSV is detected
 DELIMITERS = ",;\t| "
-csv.field_size_limit(2**31 - 1)  # A line is cut before it is that long.
-
 SAMPLE_LINES = 100  # Last lines of the head, which show the delimiter and the number of columns
 MIN_SHARE = 0.2  # Of the last lines that are rows of a table without a heading
 MAX_CELL_LINES = 8  # Lines of a cell with line breaks
@@ -169,7 +167,9 @@ def format_of(path: Path, head: bytes, given: Dialect = DETECTED) -> CsvFormat:
     best = max(tables, key=lambda table: table.score)
     if not best.score:
         line, delimiter = given.heading or given.skip + 1, tables[0].delimiter
-        names = [name.strip() for name in next(_reader(lines[line - 1 : line], delimiter), [])]
+        names = [
+            name.strip() for name in next(_reader([one[:HEAD_BYTES] for one in lines[line - 1 : line]], delimiter), [])
+        ]
         return CsvFormat(names, delimiter, given.decimal or ".", encoding, line + 1)
     found = best.format(path, encoding)
     return found._replace(first=max(found.first, rows + 2 if begin >= 0 else 0))

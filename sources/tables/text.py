@@ -78,7 +78,7 @@ def after_heading(file: TextIO, kind: CsvFormat) -> TextIO:
 def csv_rows(path: Path, given: Dialect = DETECTED) -> Iterator[list[str]]:
     """Yield the cells of the rows of a CSV."""
     kind = csv_format(path, given)
-    with open_text(path, kind) as file:
+    with open_text(path, kind) as file, suppress(csv.Error):  # It is reported when the rows are read.
         yield from filter(kind.fits, kind.cells(after_heading(file, kind)))
 
 

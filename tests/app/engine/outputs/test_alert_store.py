@@ -13,7 +13,7 @@ from app.engine.outputs.alerts import SETTLE_S
 from app.engine.outputs.receivers import Deliveries
 from app.engine.store import Store
 from app.twin.secrets import NO_SECRETS
-from config.output_schema import ReceiverSection
+from config.output_schema import AnyReceiver
 from estimators.errors import SourceError
 from tests.app.engine.outputs.pushed import publishing, push
 from tests.app.engine.outputs.test_alerts import Looked, Receiver, episode, started, state
@@ -92,7 +92,7 @@ class Process:
         self.receiver = Receiver(dead)
         monkeypatch.setattr("app.engine.outputs.receivers.make_receivers", lambda *_: {"ops": self.receiver})
         self.notices = Notices(lambda: 0)
-        section = ReceiverSection(type="any")
+        section = AnyReceiver(type="any")
         self.deliveries = Deliveries({"ops": section}, folder, None, self.notices, NO_SECRETS)
         self.looked = make(**rule)
         self.file = Store(folder / "motor.store")

@@ -89,7 +89,7 @@ def test_the_page_has_a_field_for_each_option_and_each_unit():
     labels = re.findall(r'(\w+): "', named[0])
     assert {label.lower() for label in labels} == options - {"dbc", "time", "unit"}
     words = set(re.search(r"\(([^()]*)\)$", FIELD.pattern)[1].split("|"))
-    assert words == {label.lower() for label in labels} - {"zone"} | {"unit"}
+    assert words == {label.lower() for label in labels} | {"unit"}
     units = re.findall(r'(\w+): "', re.search(r"UNITS = \{(.*)\};", PAGE)[1])
     assert units == [*UNITS, *SERIAL_DAYS]
 
